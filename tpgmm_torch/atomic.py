@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable, Iterator
@@ -10,10 +11,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["consistent", "open_whole", "read_whole", "recover", "replacing"]
+__all__ = ["consistent", "contents", "open_whole", "read_whole", "recover", "replacing"]
 
 #: How a file begins that stands for one which Git LFS has not fetched.
 POINTER = b"version https://git-lfs.github.com/spec/"
+#: What file managers leave behind.
+LEFT_OVER = re.compile(r"\._.*|\.DS_Store|Thumbs\.db|desktop\.ini", re.IGNORECASE)
+
+
+def contents(folder: Path) -> set[str]:
+    """Names of what is in a folder, without what file managers leave behind."""
+    return {item.name for item in folder.iterdir() if not LEFT_OVER.fullmatch(item.name)}
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
-from tpgmm_torch.atomic import consistent, read_whole, replacing
+from tpgmm_torch.atomic import consistent, contents, read_whole, replacing
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -99,12 +99,12 @@ def save(model: Any, path: str | Path) -> None:
 
 def _replaceable(path: Path) -> bool:
     """Whether nothing but a model, or nothing at all, is lost by replacing what is there."""
-    if not path.is_dir() or {item.name for item in path.iterdir()} - set(FILES):
+    if not path.is_dir() or contents(path) - set(FILES):
         return False
     try:
         return bool(json.loads(read_whole(path / CONFIG))["format"] == FORMAT["format"])
     except FileNotFoundError:
-        return not any(path.iterdir())
+        return not contents(path)
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return False
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_datasets.conversion.joints import joint_feature
+from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
 from tpgmm_datasets.lerobot.episodes import read_episodes
@@ -76,7 +76,8 @@ class DatasetInfo:
     lengths : tuple of int
         Rows of each episode, by the metadata.
     problems : tuple of DatasetError
-        All that is wrong; empty for a set that loads.
+        All that is wrong; empty for a set that loads. What is wrong with the joints, and what
+        is given may mend, has ``check="joints"``.
     """
 
     path: Path
@@ -142,11 +143,12 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
             if key in ranges:
                 low, high = np.minimum(low, ranges[key][0]), np.maximum(high, ranges[key][1])
             ranges[key] = low, high
+    joints = None
     try:
         joints = joint_feature(layout)
+        names_of(layout.feature(joints), None, None)
     except DatasetError as problem:
         problems.append(problem)
-        joints = None
     environment = layout.features.get(ENVIRONMENT)
     return DatasetInfo(
         layout.root,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from tpgmm_datasets.errors import DatasetError
@@ -11,42 +13,77 @@ from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_grou
 __all__ = ["POSE_PARTS", "match_names", "pose_groups", "quaternion_groups", "value_names"]
 
 
-def value_names(names: Any, width: int, distinct: bool = True) -> tuple[str, ...] | None:
+def value_names(
+    names: Any, width: int, key: str = "", distinct: bool = True
+) -> tuple[tuple[str, ...] | None, str]:
     """Flatten what ``info.json`` gives as names of a feature's values.
 
     Parameters
     ----------
     names : list, dict or None
-        A flat list, a list in a list, ``{"motors": [...]}``, or name to position.
+        A list, lists in lists, groups ``{"left": [...], "right": [...]}``, or name to position.
+        A name that several groups have is put behind its group's.
     width : int
         How many values the feature has.
+    key : str
+        Of the feature: a list of nothing but its last word names no value.
     distinct : bool, default=True
-        Whether repeated names count as none.
+        Whether each may be there once only.
 
     Returns
     -------
     tuple of str or None
-        None where there is no name for each value.
+        A name for each value; None where there are none, or they cannot be used.
+    str
+        Why they cannot be used, empty where they can or there are none.
     """
-    if isinstance(names, dict):
-        if names and all(type(value) is int for value in names.values()):
-            names = sorted(names, key=lambda name: names[name])
+    found = list(_leaves(names)) if names else []
+    if not found or (len(found) == 1 < width and found[0][1] in re.split(r"[./]", key)):
+        return None, ""
+    if places := [place for *_, place in found if place is not None]:
+        counts = [[*range(first, len(found) + first)] for first in (0, 1)]
+        if {*map(type, places)} != {int} or sorted(places) not in counts:
+            return None, f"the positions of the names, {places}, do not count the values"
+        found.sort(key=lambda leaf: leaf[2])
+    bare = [name for _, name, _ in found]
+    if wrong := [name for name in bare if not isinstance(name, str) or not name.strip()]:
+        return None, f"{wrong[0]!r} is no name, of {bare}"
+    if len(found) != width:
+        return None, f"{len(found)} names for {width} values, {bare}"
+    if not distinct:
+        return tuple(bare), ""
+    shared = {name for name, count in Counter(bare).items() if count > 1}
+    flat = ["_".join((*g, name)) if name in shared else name for g, name, _ in found]
+    if twice := [name for name, whole in zip(bare, flat, strict=True) if flat.count(whole) > 1]:
+        return None, f"{twice[0]!r} is there twice, of {bare}"
+    return tuple(flat), ""
+
+
+def _leaves(names: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
+    """Groups, name and position (None where none is given) of each name, to any depth."""
+    rest: list[tuple[tuple[str, ...], Any, Any]] = [((), names, None)]
+    while rest:
+        groups, name, place = rest.pop()
+        if isinstance(name, list):
+            rest += [(groups, value, None) for value in reversed(name)]
+        elif isinstance(name, dict):
+            rest += [
+                ((*groups, k), v, None) if isinstance(v, dict | list) else (groups, k, v)
+                for k, v in reversed(name.items())
+            ]
         else:
-            names = list(names.values())
-    while isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
-        names = names[0]
-    if not isinstance(names, list) or len(names) != width:
-        return None
-    if not all(isinstance(name, str) for name in names):
-        return None
-    if distinct and len(set(names)) < width:
-        return None
-    return tuple(names)
+            yield groups, name, place
 
 
+#: What can be said where names do not match, and where there are none that can be used.
 JOINT_NAMES = (
     "Give joint_names={'name in the data set': 'joint of the robot', ...} (--joint-name "
     "STORED=JOINT)"
+)
+NAME_ALL = (
+    "Name all values in order, joint_names=['...', ...] (--joint-name NAME,NAME,...), or "
+    "say that they are the robot's joints in its order, joint_names='robot' (--joint-name "
+    "robot)"
 )
 
 

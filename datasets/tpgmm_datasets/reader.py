@@ -18,18 +18,23 @@ from tpgmm_datasets.conversion.assembly import (
     event_sources,
     frame_sources,
 )
-from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
+from tpgmm_datasets.conversion.joints import (
+    JointColumns,
+    commanded_joints,
+    joint_feature,
+    names_of,
+)
 from tpgmm_datasets.errors import DatasetError, summed_up
 from tpgmm_datasets.events import doubtful_events
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
-from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Scale, Unit, Units, fits
-from tpgmm_torch.checks.report import Report
+from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
@@ -55,11 +60,14 @@ class Recording:
         What a demonstration is made of.
     relax : collection of str
         Checks whose problems leave an episode out, and are warned of.
+    findings : tuple of Finding
+        What is unlikely about its metadata.
     """
 
     episodes: tuple[Episode, ...]
     assembly: Assembly
     relax: Collection[str]
+    findings: tuple[Finding, ...] = ()
 
     def demonstrations(self, check: bool = True) -> Iterator[Demonstration]:
         """Read the wanted episodes, one when it is asked for.
@@ -135,7 +143,7 @@ class Recording:
             for one in report
         ]
         doubtful = doubtful_events(self.assembly.doubtful, "episode")
-        return Report.of([*findings, *doubtful], report.subject)
+        return Report.of([*self.findings, *findings, *doubtful], report.subject)
 
 
 def open_recording(
@@ -175,7 +183,8 @@ def open_recording(
     policy.warn()
     feature = layout.feature(joint_feature(layout, joints))
     if calibration is not None:
-        units = _calibrated(feature, calibration, joint_names, units)
+        names = feature.names or names_of(feature, joint_names, robot)
+        units = _calibrated(feature, calibration, names, units)
     columns = JointColumns.choose(feature, joint_names, units, robot)
     pairs = zip(feature.names or (), columns.units, strict=False)
     unknown = [name for name, unit in pairs if unit == "auto"]
@@ -195,13 +204,18 @@ def open_recording(
     stated = stated_range(layout.root, feature.key, feature.width)
     if stated is not None:
         assembly.joints.values(stated, file="meta/stats.json")
-    return Recording(chosen, assembly, policy.names)
+    findings = () if joints else tuple(commanded_joints(layout, feature.key))
+    if frames is None and (objects := layout.features.get(ENVIRONMENT)) and objects.misnamed:
+        message = f"no frame is read of {ENVIRONMENT!r}, {objects.misnamed}"
+        remedy = "Say where each is, frames={...} (--frame NAME=FEATURE[0:7])"
+        findings += (Finding("frames", message, remedy, (ENVIRONMENT,)),)
+    return Recording(chosen, assembly, policy.names, findings)
 
 
 def _calibrated(
     feature: Feature,
     calibration: Calibration,
-    joint_names: Mapping[str, str] | Sequence[str] | None,
+    names: tuple[str, ...] | None,
     units: Units,
 ) -> Units:
     """Units by name: those that are given, else those of the calibration."""
@@ -210,8 +224,6 @@ def _calibrated(
             f"units={units!r} is for all values, and so is a calibration: give one of them, or "
             "units by name"
         )
-    listed = joint_names if isinstance(joint_names, Sequence) else None
-    names = feature.names or (None if listed is None else tuple(listed))
     if names is None:
         message = "the metadata do not name the values: a calibration needs joint_names=[...]"
         raise DatasetError(message, column=feature.key)
@@ -298,9 +310,10 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         The feature that holds the joints, or ``"measured"`` (``observation.state``, ``state``
         and their variants) or ``"commanded"`` (``action``). The default is what was measured,
         else what was commanded. Measured joints lag behind commanded ones.
-    joint_names : mapping or sequence of str, optional
+    joint_names : mapping or sequence of str, or "robot", optional
         Names instead of the data set's: all of them in order, or name in the set to name of
-        the robot's joint for those that differ.
+        the robot's joint for those that differ. ``"robot"``: the values are the robot's joints
+        in its order, which a set that names none, or not so that it can be used, needs.
     units : str, Scale, or mapping of name to these, default="auto"
         ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is), ``"lerobot"``
         (degrees, and a gripper's 0 to 100 as the limits of that joint of the robot, else raw)

@@ -76,9 +76,10 @@ class Signals:
         assembly = recording.assembly
         layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
         called = joint_names if isinstance(joint_names, Mapping) else {}
-        state = _renamed(layout.features.get(STATE, source), called)
+        given = None if called or joint_names is None else columns.names
+        state = _renamed(layout.features.get(STATE, source), source, called, given)
         action = layout.features.get(ACTION)
-        action = action and _renamed(action, called)
+        action = action and _renamed(action, source, called, given)
         environment = layout.features.get(ENVIRONMENT)
         scales = {
             name: as_scale(unit, source.key)
@@ -103,9 +104,17 @@ class Signals:
         )
 
 
-def _renamed(feature: Feature, called: Mapping[str, str]) -> Feature:
-    names = feature.names and tuple(called.get(name, name) for name in feature.names)
-    return replace(feature, names=names)
+def _renamed(
+    feature: Feature, source: Feature, called: Mapping[str, str], given: tuple[str, ...] | None
+) -> Feature:
+    """As somebody calls its values; what names none has the names of the joints in order."""
+    names, alike = feature.names, feature.width == source.width
+    if feature.misnamed and not (alike and given):
+        message = f"its values cannot be told apart: {feature.misnamed}. {REMEDY}"
+        raise DatasetError(message, column=feature.key)
+    if alike and (names is None or (given and names == source.names)):
+        names = given or source.names
+    return replace(feature, names=names and tuple(called.get(name, name) for name in names))
 
 
 def _plain(pose: FramePose) -> bool:

@@ -9,6 +9,7 @@ and, of trajectories, the upper triangle of the joints' covariance (``covariance
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,12 @@ from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups
 from tpgmm_torch.data.trajectories import Trajectory
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    PlausibilityWarning,
+    UnknownNameError,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +49,26 @@ EPISODE = "episode"
 JOINTS = "joints"
 #: Fewer rows do not show that a column counts them.
 FEWEST_COUNTED = 4
+#: A column that changes per second by these, up to a share, is a clock (ns, us, ms, s).
+CLOCKS, CLOCK_ERROR = (1e9, 1e6, 1e3, 1.0), 0.05
+#: Times from here on are since 1970, in this unit.
+SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11}
+#: What is so called is no joint.
+COUNTS = re.compile(
+    r"(?i)((.*[._/])?(time_?stamp|stamp|seq|nanosec|nsecs?)|(.*stamp[._/])?secs?|time|clock|step"
+    r"|tick|frame|index|(frame|episode|task|sample)_(index|id|nr))(_(s|ms|us|ns))?"
+)
+#: Columns of poses as ROS calls them.
+ROS_POSE = re.compile(
+    r"(?:(.*?)[./_])??(?:(?:pose|transform)[./_])*"
+    r"(?:(?:position|translation)[./_](?P<x>[xyz])|(?:orientation|rotation)[./_](?P<q>[wxyz]))"
+)
+#: How a text begins that spreadsheets take for a formula.
+FORMULA = re.compile(r"'*[=+@\t\r-]")
+#: How pandas calls a column without a name.
+UNNAMED = re.compile(r"(Unnamed: \d+)?")
+#: Rows times columns beyond which a table is not read.
+MOST_NUMBERS = 2e7
 
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
@@ -168,9 +194,10 @@ def demonstrations_from_frame(
     [Demonstration(2 steps, 0.10 s, 2 joints, frames=[], events={})]
     """
     table = _checked(table, joints, time, episode)
-    names = list(joints) if joints is not None else _joints(table, time, episode)
     whole = episode not in table.columns
-    parts = [(0, table)] if whole else table.groupby(episode, sort=False)
+    parts = [(0, table)] if whole else [*table.groupby(episode, sort=False)]
+    parts = [(label, _in_seconds(part, time)) for label, part in parts]
+    names = list(joints) if joints is not None else _joints(table, parts, time, episode)
     made = []
     for label, part in parts:
         kept = part.dropna(axis="columns", how="all")
@@ -201,7 +228,8 @@ def write_table(table: pd.DataFrame, path: str | Path) -> None:
     table : pandas.DataFrame
         Of any of these functions.
     path : str or Path
-        Ends in .csv, which has all digits, or .parquet.
+        Ends in .csv, which has all digits, or .parquet. In a .csv a quote stands before names
+        that spreadsheets would take for a formula.
 
     Raises
     ------
@@ -211,7 +239,8 @@ def write_table(table: pd.DataFrame, path: str | Path) -> None:
     path = _known(Path(path))
     with replacing(path) as new:
         if path.suffix == ".csv":
-            table.to_csv(new, index=False)
+            safe = [f"'{n}" if FORMULA.match(str(n)) else n for n in table.columns]
+            table.to_csv(new, index=False, header=safe)
         else:
             table.to_parquet(new, index=False)
 
@@ -222,7 +251,9 @@ def read_table(path: str | Path) -> pd.DataFrame:
     Parameters
     ----------
     path : str or Path
-        A .csv whose first line has the names of the columns, or a .parquet.
+        A .csv whose first line has the names of the columns, or a .parquet. Fields of a .csv
+        are separated by commas, or by semicolons, tabs or blanks, and numbers may have decimal
+        commas then.
 
     Raises
     ------
@@ -234,8 +265,27 @@ def read_table(path: str | Path) -> pd.DataFrame:
     path, pandas = _known(Path(path)), _pandas()
     try:
         if path.suffix == ".csv":
-            # by default pandas is quicker, and wrong in the last digit
-            return pandas.read_csv(path, float_precision="round_trip")
+            with path.open(encoding="utf-8", errors="replace") as file:
+                head, row = file.readline().strip(), file.readline()
+            marks = [mark for mark in ",;\t" if mark in head and mark in row]
+            mark = marks[0] if marks else "," if "," in head else r"\s+"
+            comma = mark != "," and re.search(r"\d,\d", row)
+            # by default pandas is quicker and wrong in the last digit, and takes the first
+            # column for names of rows where these are longer than the header
+            options: dict[str, Any] = {
+                "decimal": "," if comma else ".",
+                "float_precision": "round_trip",
+            }
+            options |= {"sep": mark, "index_col": False, "skipinitialspace": True}
+            with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
+                read = pandas.read_csv(path, **options)
+            return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
+        from pyarrow import parquet
+
+        rows, columns = parquet.read_metadata(path).num_rows, len(parquet.read_schema(path))
+        if rows * columns > MOST_NUMBERS:
+            most = f"at most {MOST_NUMBERS:g} numbers are read: write it in parts"
+            raise ValueError(f"it has {rows} rows of {columns} columns; {most}")
         return pandas.read_parquet(path)
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
@@ -243,6 +293,8 @@ def read_table(path: str | Path) -> pd.DataFrame:
         raise DependencyError(
             f"{path} needs pyarrow: pip install 'tpgmm-torch[data]'"
         ) from error
+    except pandas.errors.ParserWarning as error:
+        raise DataError(f"{path} has rows of more fields than its header names") from error
     except (OSError, ValueError) as error:  # also those of the parsers
         raise DataError(f"{path} is no table: {error}") from error
 
@@ -307,10 +359,19 @@ def _checked(
     """The table with texts for names, each there once, and all that are asked for."""
     if not hasattr(table, "columns"):
         raise DataError(f"a table is a pandas DataFrame, got {type(table).__name__}")
-    table = table.rename(columns=str)
-    twice = table.columns[table.columns.duplicated()]
-    if len(twice):
-        raise DataError(f"the table has columns of one name: {sorted(set(twice))}")
+    if table.index.name == time:
+        table = table.reset_index()
+    kept = {*(joints or ()), *table.attrs.get(JOINTS, ())}
+    table = table.rename(columns=lambda n: n if n in kept else _plain(str(n).strip()))
+    table = table.dropna(how="all")
+    # the second of one name is NAME.1 of pandas
+    again = [n for n in table.columns if n not in kept and re.fullmatch(r".+\.\d+", n)]
+    twice = {n for n in again if n.rpartition(".")[0] in table.columns}
+    if twice := twice | {*table.columns[table.columns.duplicated()]}:
+        raise DataError(f"the table has columns of one name: {sorted(twice)}")
+    if len(table.columns) == 1 and (found := re.findall(r"[,;\t]|\s+", table.columns[0])):
+        message = f"the table has one column, {table.columns[0]!r}: its fields are separated by"
+        raise DataError(f"{message} {found[0]!r}, pandas.read_csv(..., sep={found[0]!r})")
     asked = () if episode == EPISODE else (episode,)
     for name in (time, *asked, *(joints or ())):
         if name not in table.columns:
@@ -319,10 +380,17 @@ def _checked(
         raise DataError("the table has no rows")
     if episode in table.columns and table[episode].isna().any():
         raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
-    return table
+    empty = [
+        n for n in _others(table, {time, episode, *(joints or ())}) if table[n].isna().all()
+    ]
+    if told := [name for name in empty if not UNNAMED.fullmatch(name)]:
+        _warn(f"columns {told} of the table are empty, and left out")
+    return table.drop(columns=empty)
 
 
-def _joints(table: pd.DataFrame, time: str, episode: str) -> list[str]:
+def _joints(
+    table: pd.DataFrame, parts: Sequence[tuple[Any, pd.DataFrame]], time: str, episode: str
+) -> list[str]:
     """Columns that are joints: those known to be, and those that are nothing else."""
     columns = _others(table, {time, episode})
     known = {name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns}
@@ -342,22 +410,65 @@ def _joints(table: pd.DataFrame, time: str, episode: str) -> list[str]:
             "add them (1, 0, 0, 0 where no orientation was recorded), or say which columns are "
             "joints: joints=[...]"
         )
-    counters = [name for name in taken if _counts_rows(table, name, episode)]
-    if counters:
+    values = [name for name in taken if table[name].dtype.kind in "iuf"]
+    counters = [name for name in values if COUNTS.fullmatch(name)]
+    steady = {n: _steady(parts, n, time) for n in values if n not in counters}
+    if counters := [*counters, *(n for n, kind in steady.items() if kind == "counter")]:
         raise DataError(
-            f"columns {counters} count the rows and are no joints: drop them (pandas leaves "
-            "its own out of a file with index=False), or say which are: joints=[...]"
+            f"columns {counters} count the rows or tell the time, and are no joints: drop them "
+            "(pandas leaves its own out of a file with index=False), or say which are: "
+            "joints=[...]"
+        )
+    if unnamed := [name for name in taken if UNNAMED.fullmatch(name)]:
+        raise DataError(f"columns {unnamed} have no name: name or drop them, or joints=[...]")
+    if even := [name for name, kind in steady.items() if kind]:
+        _warn(
+            f"columns {even} change by the same in every row: are they joints (joints=[...]), "
+            "or do they count something? Then drop them"
         )
     return names
 
 
-def _counts_rows(table: pd.DataFrame, name: str, episode: str) -> bool:
-    """Whether a column holds whole numbers that go up by one in every episode."""
-    if table[name].dtype.kind not in "iu" or len(table) < FEWEST_COUNTED:
-        return False
-    groups: Any = table[episode] if episode in table.columns else np.zeros(len(table))
-    steps = table[name].groupby(groups).diff().dropna()
-    return bool(len(steps)) and bool((steps == 1).all())
+def _warn(message: str) -> None:
+    warnings.warn(message, PlausibilityWarning, stacklevel=4)
+
+
+def _steady(parts: Sequence[tuple[Any, pd.DataFrame]], name: str, time: str) -> str:
+    """Whether a column is a ``"counter"``, a clock too, or changes ``"evenly"`` throughout."""
+    steps = np.concatenate([np.diff(part[name].to_numpy(float)) for _, part in parts])
+    if len(steps) < FEWEST_COUNTED - 1 or not steps[0]:
+        return ""
+    even = np.allclose(steps, steps[0], rtol=1e-6, atol=0)
+    ticks = np.concatenate([np.diff(part[time].to_numpy(float)) for _, part in parts])
+    rates = [rate for rate in CLOCKS if np.allclose(steps, rate * ticks, CLOCK_ERROR, 0)]
+    return "counter" if rates or (even and steps[0] % 1 == 0) else "evenly" * even
+
+
+def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
+    """An episode's time and events in seconds: of dates, those since its first row."""
+    first, kind = part[time].iloc[0], part[time].dtype.kind
+    unit = next((u for u, low in SINCE_1970.items() if kind in "iuf" and first >= low), None)
+    if kind in "biuf" and unit is None:
+        return part
+    options = {"unit": unit} if unit else {"format": "ISO8601", "utc": True}
+    names = [time, *(name for name in part.columns if name.startswith(EVENT))]
+    try:
+        dates = part[names]
+        dates = dates if kind == "m" else dates.apply(_pandas().to_datetime, **options)
+        since = (dates - dates[time].iloc[0]).apply(lambda column: column.dt.total_seconds())
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise DataError(
+            f"column {time!r} holds neither numbers nor dates, its first value is {first!r}: "
+            "convert it to seconds"
+        ) from error
+    return part.assign(**since)
+
+
+def _plain(name: str) -> str:
+    """A column's name; those of ROS's poses become this module's."""
+    if match := ROS_POSE.fullmatch(name):
+        return f"{(match[1] or 'pose').strip('/')}.{match['x'] or 'q' + match['q']}"
+    return name
 
 
 def _others(table: pd.DataFrame, known: set[str]) -> list[str]:
@@ -410,7 +521,8 @@ def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
         if values.dtype.kind not in "biuf":
             raise DataError(
                 f"column {name!r} holds no numbers, its first value is {values.iloc[0]!r}: "
-                "leave it out of the table, or out of joints=[...]"
+                "leave it out of the table, or out of joints=[...]; decimal commas are read by "
+                "pandas.read_csv(..., decimal=',')"
             )
         if values.isna().any():
             row = values.index[values.isna()][0]

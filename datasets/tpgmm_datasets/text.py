@@ -48,12 +48,17 @@ def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
     return {name: parse_event(how) for name, how in pairs.items()} or None
 
 
-def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | None:
+def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | list[str] | str | None:
     """The argument ``joint_names``; None without texts.
 
-    Each text is ``STORED=JOINT``; anything else is a DataError.
+    The texts are ``STORED=JOINT`` for some, or one of ``NAME,NAME,...`` for all or ``robot``;
+    anything else is a DataError.
     """
-    return _pairs(texts, "joint name", "STORED=JOINT", "main_elbow=elbow_flex") or None
+    if len(texts) == 1 and "=" not in texts[0] and texts[0].strip():
+        names = [name.strip() for name in texts[0].split(",")]
+        return "robot" if names == ["robot"] else names
+    form = "STORED=JOINT (or, of all values, NAME,NAME,... or robot)"
+    return _pairs(texts, "joint name", form, "main_elbow=elbow_flex") or None
 
 
 def _pairs(texts: Sequence[str], kind: str, form: str, example: str) -> dict[str, str]:

@@ -43,7 +43,7 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     _check_rate(config, dataset)
     config.fps = float(dataset.fps)
     if config.units is None:
-        config.units = _units(dataset.features)
+        config.units = _units(config, dataset.features)
     elif isinstance(config.units, str) and config.units.endswith(".json"):
         names = config.state_names or []
         scales = calibrated_units(config.units, tuple(names))
@@ -58,6 +58,8 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     if kinematics is None:
         size = dataset.features[OBS_STATE]["shape"][0]
         kinematics = JointSpace(config.state_names or [f"joint_{i}" for i in range(size)])
+    else:
+        _check_named(config, kinematics)
     _check_links(config, kinematics)
     given = config.decoded_operators() or ()
     frames = _frames(config, kinematics, given)
@@ -108,19 +110,35 @@ def _check_rate(config: TPGMMConfig, dataset: Any) -> None:
 
 def _names(features: Mapping[str, Any], key: str) -> list[str] | None:
     feature = features.get(key)
-    if feature is None:
+    if feature is None or len(feature["shape"]) != 1:
         return None
-    shape = feature["shape"]
-    names = value_names(feature.get("names"), shape[0]) if len(shape) == 1 else None
+    names, wrong = value_names(feature.get("names"), feature["shape"][0], key)
+    if wrong:
+        raise DataError(
+            f"the names of {key} in the data set cannot be used, {wrong}: mend them in "
+            f"meta/info.json, or say them, --policy.{NAMES[key]}='[...]'"
+        )
     return None if names is None else list(names)
 
 
-def _units(features: Mapping[str, Any]) -> dict[str, list[float] | str]:
+def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
+    """Whether somebody says which value is which joint of a robot."""
+    unnamed = {key: f"--policy.{NAMES[key]}='[...]'" for key in (OBS_STATE, ACTION)}
+    unnamed = {k: text for k, text in unnamed.items() if getattr(config, NAMES[k]) is None}
+    if unnamed and kinematics.n_joints > 1:
+        raise DataError(
+            f"the data set does not name the values of {' and '.join(unnamed)}, and nothing "
+            f"else tells which are the robot's joints, {list(kinematics.joint_names)}: say "
+            f"their names in order, {' '.join(unnamed.values())}"
+        )
+
+
+def _units(config: TPGMMConfig, features: Mapping[str, Any]) -> dict[str, list[float] | str]:
     """Units by name, where the data set declares them (this project's writer does)."""
     units: dict[str, list[float] | str] = {}
     for key in (OBS_STATE, ACTION):
         declared = (features.get(key, {}).get("info") or {}).get("units")
-        names = _names(features, key)
+        names = getattr(config, NAMES[key])
         if names and isinstance(declared, list) and len(declared) == len(names):
             units |= dict(zip(names, declared, strict=True))
     return units

@@ -9,7 +9,7 @@ from typing import Any
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets.signals import Signals
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import read_whole
+from tpgmm_torch.atomic import contents, read_whole
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["write_pretrained"]
@@ -58,4 +58,4 @@ def _replaceable(path: Path) -> bool:
         is_policy = json.loads(read_whole(config)).get("type") == TPGMMPolicy.name
     except (OSError, ValueError, AttributeError, RecursionError):
         is_policy = False
-    return is_policy or not any(path.iterdir())
+    return is_policy or not contents(path)

@@ -107,6 +107,23 @@ def test_several_robots_are_one_text():
         assert made.robot == given and made.kinematics() == parse_robot("bi_so101")
 
 
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (None, r"does not name the values of observation.state, .*--policy.state_names="),
+        ([*NAMES[:16], NAMES[0]], r"'\w+' is there twice.*--policy.state_names="),
+        (list(NAMES[:16]), r"16 names for 17 values.*--policy.state_names="),
+    ],
+)
+def test_values_of_a_robot_are_named_by_somebody(names, told):
+    state = {STATE: {"dtype": "float32", "shape": (17,), "names": names}}
+    with pytest.raises(DataError, match=told):
+        adopt(config(**UPPER_BODY), dataset(20, **environment(POSE), **state))
+    said = config(**UPPER_BODY, state_names=list(NAMES[::-1]))
+    adopt(said, dataset(20, **environment(POSE), **state))
+    assert said.state_names == list(NAMES[::-1])
+
+
 @pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])
 def test_joints_are_chosen_by_patterns(joints):
     made = draccus.parse(

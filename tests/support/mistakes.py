@@ -530,6 +530,51 @@ def a_frame_at_an_event_that_is_not_there(folder):
     load_lerobot(root, robot=robot, frames={"cup": LinkPose("hand", "touch")})
 
 
+def named(root, names):
+    sets.change_info(root, lambda i: i["features"]["observation.state"].update(names=names))
+    sets.change_table(root, sets.DATA, lambda table: table)
+    return root
+
+
+ARM = sets.Arm("left_elbow", "right_elbow", "gripper")
+
+
+@mistake("names", r"'gripper' is there twice.*--joint-name")
+def a_set_that_names_two_values_alike(folder):
+    load_lerobot(named(stored(folder), ["left_elbow", "gripper", "gripper"]), robot=ARM)
+
+
+@mistake("names", r"2 names for 3 values.*--joint-name")
+def a_set_that_names_too_few_values(folder):
+    load_lerobot(named(stored(folder), ["left_elbow", "right_elbow"]), robot=ARM)
+
+
+@mistake("names", r"0 is no name.*--joint-name")
+def a_set_with_numbers_for_names(folder):
+    load_lerobot(named(stored(folder), {"motors": [0, 1, 2]}), robot=ARM)
+
+
+@mistake("names", r"does not name its 3 values.*--joint-name robot")
+def a_set_without_names(folder):
+    load_lerobot(named(stored(folder), None), robot=ARM)
+
+
+@mistake("names", r"joints: 'action' is read.*measured_joints.*--joints")
+def measured_joints_under_another_name(folder):
+    root, name = stored(folder), "measured_joints"
+    sets.change_table(
+        root,
+        sets.DATA,
+        lambda t: t.rename_columns(
+            [name if c == "observation.state" else c for c in t.column_names]
+        ),
+    )
+    sets.change_info(
+        root, lambda i: i["features"].update({name: i["features"].pop("observation.state")})
+    )
+    load_lerobot(root)
+
+
 # -- quaternions ---------------------------------------------------------------------------
 
 
@@ -767,6 +812,16 @@ def another_skill_among_them(_):
     lint(one(lambda d: replace(d, joints=d.joints.flip(0) + 0.9 * torch.sin(d.time)[:, None])))
 
 
+@mistake("values", r"episodes: .*run backwards: demonstration 2")
+def a_recording_in_reverse(_):
+    lint(one(lambda d: replace(d, joints=d.joints.flip(0)), demonstrations=shown()[:4]))
+
+
+@mistake("values", r"still: joints never move.*: l_elbow")
+def a_joint_that_was_not_recorded(_):
+    lint(each(joints(0.0, upper_body().joint_names.index("l_elbow"))))
+
+
 @mistake("values", r"start: start posture: .*shown")
 def a_start_far_from_those_shown(_):
     start = usual().joints.clone()
@@ -857,6 +912,57 @@ def a_file_for_the_robot_of_a_set(folder):
 @mistake("files", r"\['Unnamed: 0'\] count the rows")
 def a_table_with_numbers_of_rows(folder):
     demonstrations_to_frame(shown()).to_csv(folder / "log.csv")
+    demonstrations_from_frame(read_table(folder / "log.csv"))
+
+
+def table_of(**columns):
+    table = demonstrations_to_frame(shown()[:2])
+    table.attrs.clear()  # as CSV does
+    return table.assign(**columns)
+
+
+def stamps():
+    return np.concatenate([np.arange(len(d)) / 5 for d in shown()[:2]])
+
+
+@mistake("files", r"\['clock'\] count the rows or tell the time")
+def a_table_with_a_second_clock(_):
+    demonstrations_from_frame(table_of(clock=99 + stamps()))
+
+
+@mistake("files", r"\['count'\] count the rows")
+def a_table_that_counts_in_floats(_):
+    demonstrations_from_frame(table_of(count=5 * stamps()))
+
+
+@mistake("files", r"\['progress'\] change by the same in every row")
+def a_table_with_progress(_):
+    demonstrations_from_frame(table_of(progress=stamps() / 7))
+
+
+@mistake("files", r"\['note'\] of the table are empty")
+def a_table_with_an_empty_column(_):
+    demonstrations_from_frame(table_of(note=math.nan))
+
+
+@mistake("files", r"columns of one name: \['l_elbow.1'\]")
+def a_table_with_a_column_twice(_):
+    demonstrations_from_frame(table_of(**{"l_elbow.1": stamps() ** 2}))
+
+
+@mistake("files", r"'time' holds neither numbers nor dates.*'31\.1\.26'")
+def a_table_with_another_calendar(_):
+    demonstrations_from_frame(table_of(time="31.1.26"))
+
+
+@mistake("files", r"'elbow' holds no numbers.*'0,5'.*decimal=','")
+def a_table_with_decimal_commas(_):
+    demonstrations_from_frame(table_of(elbow="0,5"))
+
+
+@mistake("files", r"more fields than its header")
+def a_table_with_a_field_too_many(folder):
+    (folder / "log.csv").write_text("time,elbow\n0.0,0.1,0.2\n0.1,0.2,0.3\n")
     demonstrations_from_frame(read_table(folder / "log.csv"))
 
 

@@ -1,6 +1,7 @@
 """What a data set calls its signals: names, units, rate, and where frames are."""
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tests.support.lerobot_sets import change_info
@@ -43,6 +44,23 @@ def test_entries_are_called_as_the_joints_are(stored):
     told = Signals.of(stored, Other(), units="deg", joint_names=names)
     assert told.state_names == told.action_names == ("elbow", "wrist")
     assert set(told.units) == {"elbow", "wrist"}
+
+
+@pytest.mark.parametrize("order", ["robot", ["b", "a"]])
+@pytest.mark.parametrize("state", [None, ["a", "a"], ["q", "p"]])
+def test_names_of_all_joints_are_those_of_actions_too(tmp_path, state, order):
+    demonstration = Demonstration(np.arange(5) / 10, np.zeros((5, 2)), joint_names=("a", "b"))
+    root = save_lerobot([demonstration], tmp_path / "set", fps=10, task="stir")
+    for key in ("observation.state", "action"):
+        change_info(root, lambda i, key=key: i["features"][key].update(names=state))
+    for file in root.glob("data/*/*"):
+        pq.write_table(pq.read_table(file).replace_schema_metadata(None), file)
+    told = Signals.of(root, Arm(), joint_names=order)
+    assert told.state_names == told.action_names == ("b", "a")
+    change_info(root, lambda i: i["features"]["observation.state"].update(names=["a", "b"]))
+    if state == ["a", "a"]:
+        with pytest.raises(DatasetError, match=r"'action'.*'a' is there twice"):
+            Signals.of(root, Arm())
 
 
 def test_frames_that_no_policy_could_observe_are_left_out(stored):

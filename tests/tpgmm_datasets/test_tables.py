@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from hypothesis import given, settings
@@ -20,7 +22,12 @@ from tpgmm_datasets.tables import (
 )
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.data.pose_names import POSE_PARTS
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    PlausibilityWarning,
+    UnknownNameError,
+)
 
 NAMES = ("shoulder", "elbow")
 
@@ -224,6 +231,166 @@ def test_what_is_no_file_of_a_table_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without_pandas)
     with pytest.raises(DependencyError, match=r"pip install 'tpgmm-torch\[data\]'"):
         demonstrations_to_frame([demonstration()])
+
+
+SHOWN = demonstration()
+PLAIN = demonstrations_to_frame([SHOWN])[["time", *NAMES]]
+
+
+def text(table, between=",", comma=".", end="", head_end=""):
+    rows = [[repr(x).replace(".", comma) for x in row] for row in table.to_numpy().tolist()]
+    lines = [between.join(table.columns) + head_end, *(between.join(r) + end for r in rows)]
+    return "\n".join(lines)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.sampled_from([",", ", ", ";", "; ", "\t", " ", "   "]),
+    st.sampled_from(".,"),
+    st.sampled_from(["", "\ufeff", "  "]),
+    st.booleans(),
+)
+def test_a_table_is_read_however_its_fields_are_separated(tmp, between, comma, first, trailing):
+    comma = "." if "," in between else comma
+    end = between if trailing and between.strip() else ""
+    path = tmp / "log.csv"
+    path.write_text(first + text(PLAIN, between, comma, end), encoding="utf-8")
+    [found] = demonstrations_from_frame(read_table(path))
+    assert_same(found, replace(SHOWN, frames={}))
+
+
+@pytest.fixture(scope="module")
+def tmp(tmp_path_factory):
+    return tmp_path_factory.mktemp("tables")
+
+
+def test_rows_of_more_fields_than_the_header_are_refused(tmp_path):
+    (tmp_path / "log.csv").write_text(text(PLAIN, end=",7"))
+    with pytest.raises(DataError, match="more fields than its header"):
+        read_table(tmp_path / "log.csv")
+    (tmp_path / "log.csv").write_text(text(PLAIN.set_axis(["time", "j", "j"], axis=1)))
+    with pytest.raises(DataError, match="columns of one name"):
+        demonstrations_from_frame(read_table(tmp_path / "log.csv"))
+
+
+@given(st.text("=+-@'ab\t", min_size=1, max_size=6))
+@settings(deadline=None)
+def test_no_name_is_a_formula_in_a_file_and_each_is_read_as_it_was(tmp, name):
+    table = pd.DataFrame({"time": [0.0, 0.1], name: [0.5, 0.25]})
+    write_table(table, tmp / "table.csv")
+    head = (tmp / "table.csv").read_text().splitlines()[0].split(",")[1].strip('"')
+    assert not head.startswith(("=", "+", "-", "@", "\t"))
+    assert read_table(tmp / "table.csv").columns.tolist() == ["time", name]
+
+
+SINCE = pd.to_timedelta(0.1 * np.arange(6), "s")
+DATES = pd.Timestamp("2026-01-31 23:59:59.7") + SINCE
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        DATES,
+        DATES.tz_localize("Europe/Berlin"),
+        SINCE,
+        DATES.astype(str),
+        [one.isoformat() + "Z" for one in DATES],
+        DATES.astype("datetime64[ns]").astype("int64"),
+        DATES.astype("datetime64[us]").astype("int64"),
+        DATES.astype("datetime64[ms]").astype("int64").astype(float),
+    ],
+    ids=lambda stamps: str(stamps[0]),
+)
+def test_dates_become_seconds_since_the_first_row(stamps):
+    stamps = pd.Series(list(stamps))
+    table = PLAIN.assign(**{"time": stamps, "event.go": stamps[2]})
+    both = pd.concat([table.assign(episode=n) for n in (0, 1)], ignore_index=True)
+    for found in demonstrations_from_frame(both):
+        np.testing.assert_allclose(found.time, 0.1 * np.arange(6), atol=1e-6)
+        np.testing.assert_allclose(found.events["go"], 0.2, atol=1e-6)
+        assert found.joint_names == NAMES
+
+
+@pytest.mark.parametrize("first", ["10:00:00.1", "31.01.2026", "now and then"])
+def test_other_texts_for_time_are_refused(first):
+    with pytest.raises(DataError, match=f"neither numbers nor dates.*{first}.*seconds"):
+        demonstrations_from_frame(PLAIN.assign(time=first))
+
+
+@pytest.mark.parametrize(
+    ("place", "turn"),
+    [
+        ("cup.pose.position.{}", "cup.pose.orientation.{}"),
+        ("/cup/pose/position/{}", "/cup/pose/orientation/{}"),
+        ("cup.pose.pose.position.{}", "cup.pose.pose.orientation.{}"),
+        ("cup.transform.translation.{}", "cup.transform.rotation.{}"),
+        ("cup_position_{}", "cup_orientation_{}"),
+    ],
+)
+def test_poses_of_ros_have_w_last(place, turn):
+    columns = {place.format(a): v for a, v in zip("xyz", (1.0, 2.0, 3.0), strict=True)}
+    columns |= {turn.format(a): v for a, v in zip("xyzw", (0.0, 0.6, 0.0, 0.8), strict=True)}
+    [found] = demonstrations_from_frame(PLAIN.assign(**columns))
+    assert found.joint_names == NAMES
+    assert found.frames["cup"].position.tolist() == [1.0, 2.0, 3.0]
+    torch.testing.assert_close(
+        found.frames["cup"].orientation, torch.tensor([0.8, 0.0, 0.6, 0.0]).double()
+    )
+    with pytest.raises(DataError, match=r"part of the pose of 'cup'.*cup.qw"):
+        demonstrations_from_frame(PLAIN.assign(**columns).drop(columns=turn.format("w")))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("n", np.arange(6.0)),
+        ("n", np.arange(6.0) * 5 + 3),
+        ("n", -np.arange(6)),
+        ("moment", PLAIN["time"] + 7),
+        ("moment", PLAIN["time"] * 1000),
+        ("timestamp", np.zeros(6)),
+        ("header.stamp.sec", np.zeros(6)),
+        ("robot_timestamp_ns", np.sin(np.arange(6))),
+        ("frame_index", np.sin(np.arange(6))),
+        ("episode_index", np.zeros(6)),
+    ],
+)
+def test_clocks_and_counters_are_no_joints(name, values):
+    with pytest.raises(DataError, match=f"{name}.*count the rows or tell the time"):
+        demonstrations_from_frame(PLAIN.assign(**{name: values}))
+    [found] = demonstrations_from_frame(PLAIN.assign(**{name: values}), joints=[*NAMES, name])
+    assert found.joint_names == (*NAMES, name)
+
+
+def test_unlikely_columns_are_told():
+    with pytest.warns(PlausibilityWarning, match=r"\['progress'\] change by the same"):
+        demonstrations_from_frame(PLAIN.assign(progress=np.linspace(0, 1, 6)))
+    with pytest.warns(PlausibilityWarning, match=r"\['elbow', 'note'\].*empty"):
+        [found] = demonstrations_from_frame(PLAIN.assign(elbow=np.nan, note=None))
+    assert found.joint_names == ("shoulder",)
+    with pytest.raises(DataError, match=r"\['Unnamed: 3'\] have no name"):
+        demonstrations_from_frame(PLAIN.assign(**{"Unnamed: 3": PLAIN["elbow"] ** 2}))
+    [found] = demonstrations_from_frame(PLAIN.assign(**{"Unnamed: 3": np.nan}))
+    assert found.joint_names == NAMES
+    [found] = demonstrations_from_frame(PLAIN.set_index("time").rename(columns=" {} ".format))
+    assert_same(found, replace(SHOWN, frames={}))
+
+
+@pytest.mark.parametrize("between", [";", "\t", " "])
+def test_a_table_of_one_column_is_told_of_its_separator(between):
+    table = pd.DataFrame({between.join(("time", "elbow")): ["0 1", "1 1"]})
+    with pytest.raises(DataError, match=r"one column.*separated by .*sep="):
+        demonstrations_from_frame(table)
+    with pytest.raises(DataError, match="decimal=','"):
+        demonstrations_from_frame(PLAIN.assign(elbow="0,5"))
+
+
+def test_large_tables_are_refused_before_they_are_read(tmp_path):
+    rows = pa.table({name: pa.array(np.zeros(2_000_000)) for name in "abcdefghijk"})
+    pq.write_table(rows, tmp_path / "log.parquet")
+    assert (tmp_path / "log.parquet").stat().st_size < 1e5
+    with pytest.raises(DataError, match="2000000 rows of 11 columns"):
+        read_table(tmp_path / "log.parquet")
 
 
 def test_an_episode_column_that_is_asked_for_is_there():

@@ -51,7 +51,9 @@ def test_a_frame_that_is_none_is_refused(texts):
 def test_joint_names_are_read_from_text():
     assert parse_joint_names([]) is None
     assert parse_joint_names(["main = elbow", "b=c"]) == {"main": "elbow", "b": "c"}
-    for texts, told in (["a"], "not STORED"), (["=a"], "not"), (["a=b", "a=c"], "twice"):
+    assert parse_joint_names(["a, b,c"]) == ["a", "b", "c"]
+    assert parse_joint_names(["robot"]) == "robot"
+    for texts, told in (["a", "b=c"], "not STORED"), (["=a"], "not"), (["a=b", "a=c"], "twice"):
         with pytest.raises(DataError, match=told):
             parse_joint_names(texts)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tpgmm_torch import atomic
-from tpgmm_torch.atomic import consistent, read_whole, recover, replacing
+from tpgmm_torch.atomic import consistent, contents, read_whole, recover, replacing
 
 #: A process that saves, and dies at the n-th thing that it asks of the system, for every n;
 #: prints what is there then.
@@ -240,3 +240,12 @@ def test_the_present_folder_is_replaced_too(tmp_path, monkeypatch, here):
     save(here, "new")
     assert names(tmp_path) == ["saved"]
     assert names(path) == ["settings", "weights"]
+
+
+def test_what_file_managers_leave_behind_does_not_count(tmp_path):
+    for name in (".DS_Store", "._config.json", "Thumbs.db", "desktop.ini"):
+        (tmp_path / name).touch()
+    assert contents(tmp_path) == set()
+    for name in (".git", ".env", "thumbs.txt"):
+        (tmp_path / name).touch()
+    assert contents(tmp_path) == {".git", ".env", "thumbs.txt"}

@@ -35,7 +35,10 @@ SAME_DURATION, SAME_PHASE = 1.6, 0.15
 #: this [rad or m].
 SAME_PATH, SMALLEST_RANGE = 0.5, 0.2
 #: Fewer recordings do not show what a usual path is.
-FEWEST_PATHS = 5
+FEWEST_PATHS, FEWEST_REVERSED = 5, 3
+#: A path runs backwards if, turned around, its steps go so much along those of the median path
+#: (cosine), and by so much more than as it was recorded.
+ALONG, BACKWARDS = 0.4, 0.2
 BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
 
 
@@ -47,9 +50,9 @@ def check(
     """Check whether recordings can be what they are taken for; nothing is changed.
 
     Checked are units, limits of position and speed, the order of unnamed joints, wraps, jumps,
-    clipped and stuck values; steps of time, gaps, durations and events; positions, orientations
-    and quaternion order of frames; copies, and episodes unlike the others. What is not found is
-    not thereby right.
+    clipped, stuck and still values; steps of time, gaps, durations and events; positions,
+    orientations and quaternion order of frames; copies, and episodes that run backwards or are
+    unlike the others. What is not found is not thereby right.
 
     Parameters
     ----------
@@ -191,25 +194,44 @@ def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
 
 
 def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Iterator[Finding]:
-    """Episodes whose path is far from the median path."""
-    if len(episodes) < FEWEST_PATHS:
+    """Episodes whose path is far from the median path, or runs backwards along it."""
+    if len(episodes) < FEWEST_REVERSED:
         return
     paths = _aligned_signs(episodes, robot)
-    scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
-    squares = ((paths - np.median(paths, axis=0)) / scale) ** 2
-    distances, joints = np.sqrt(squares.mean(axis=(1, 2))), squares.mean(axis=1)
-    usual = float(np.median(distances))
-    odd = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > usual]
-    if odd:
-        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
-        most = {i: names[int(joints[i].argmax())] for i in odd}
+    paths /= np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
+    median = np.median(paths, axis=0)
+    along, turned = (
+        _cosines(np.diff(p, axis=1), np.diff(median, axis=0)) for p in (paths, paths[:, ::-1])
+    )
+    reverse = np.flatnonzero(turned > np.maximum(ALONG, along + BACKWARDS)).tolist()
+    if reverse:
+        places = [f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})" for i in reverse]
+        message = f"paths go along the median path if they run backwards: {listed(places)}"
+        remedy = "Are they stored in reverse, or another skill? Leave them out"
+        yield Finding("episodes", message, remedy, (), tuple(reverse))
+    if len(episodes) < FEWEST_PATHS:
+        return
+    squares = (paths - median) ** 2
+    distances = np.sqrt(squares.mean(axis=(1, 2)))
+    typical = float(np.median(distances))
+    far = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
+    if odd := [i for i in far if i not in reverse]:
+        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(paths.shape[-1]))
+        most = {i: names[int(squares[i].mean(axis=0).argmax())] for i in odd}
         places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
         message = (
             "paths differ from the median path, in ranges of the joints, by about "
-            f"{usual:.2g}, but {listed(places)}"
+            f"{typical:.2g}, but {listed(places)}"
         )
         remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
         yield Finding("episodes", message, remedy, tuple({*most.values()}), tuple(odd))
+
+
+def _cosines(steps: Array, usual: Array) -> Array:
+    """Of the angles between the steps (E, P - 1, n_joints) and usual ones, as vectors."""
+    lengths = np.sqrt((steps**2).sum((1, 2)) * (usual**2).sum())
+    cosines: Array = (steps * usual).sum((1, 2)) / np.maximum(lengths, 1e-12)
+    return cosines
 
 
 def _aligned_signs(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:

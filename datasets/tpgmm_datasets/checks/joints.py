@@ -11,7 +11,7 @@ from tpgmm_datasets.units import LARGEST_ANGLE
 from tpgmm_torch.checks.report import Finding, listed
 from tpgmm_torch.checks.training import FAR, IMPOSSIBLE, ranges
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.pose_names import is_gripper, quaternion_groups
+from tpgmm_torch.data.pose_names import is_gripper, pose_groups, quaternion_groups
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.tracked_poses import Poses
 
@@ -23,6 +23,8 @@ FAST, FASTEST = 1.2, 3.0
 #: Joints that usually move by this [rad or m] are stuck if they keep one value for this share
 #: of an episode, and usually less than for the second.
 MOVING, STUCK, USUALLY_STILL = 0.1, 0.4, 0.1
+#: Joints that move by less were not recorded, or do not move [rad or m].
+UNMOVED = 1e-9
 
 
 def quaternion_columns(
@@ -37,7 +39,7 @@ def quaternion_columns(
 def joint_findings(
     episodes: Sequence[RecordingSummary], robot: Kinematics | None, raw: Collection[str]
 ) -> Iterator[Finding]:
-    """Units where there are no limits, speeds, wraps, jumps, clipped and stuck values.
+    """Units where there are no limits, speeds, wraps, jumps, clipped, stuck and still values.
 
     Parameters
     ----------
@@ -73,6 +75,13 @@ def joint_findings(
     yield from _steps(episodes, names, [i for i in angles if largest[i] <= LARGEST_ANGLE])
     yield from _clipped(episodes, names, angles)
     yield from _stuck(episodes, names)
+    moved = np.max([episode.high - episode.low for episode in episodes], axis=0)
+    posed = {i for group in pose_groups(names).values() for i in group} | quaternion
+    idle = [n for i, n in enumerate(names) if moved[i] <= UNMOVED and i not in posed]
+    if idle and not isinstance(robot, Poses):  # hands may stay in a plane
+        message = f"joints never move, in any demonstration: {listed(idle)}"
+        remedy = "Were they recorded? Leave out those that the skill does not need"
+        yield Finding("still", message, remedy, tuple(idle))
 
 
 def _units(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tpgmm_datasets.errors import DatasetError, DatasetWarning
-from tpgmm_datasets.lerobot.layout import Feature, Layout
-from tpgmm_datasets.names import match_names
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT
+from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, Layout
+from tpgmm_datasets.names import NAME_ALL, match_names
 from tpgmm_datasets.units import Unit, Units, as_scale, convert, units_of
+from tpgmm_torch.checks.report import Finding
 
-__all__ = ["JointColumns", "joint_feature"]
+__all__ = ["JointColumns", "commanded_joints", "joint_feature", "names_of"]
 
 Names = Mapping[str, str] | Sequence[str]
 
@@ -22,6 +25,7 @@ Names = Mapping[str, str] | Sequence[str]
 MEASURED = ("observation.state", "observation.states", "state", "observation.qpos")
 COMMANDED = ("action", "actions")
 JOINT_FEATURES = (*MEASURED, *COMMANDED)
+LIKE_JOINTS = re.compile("joint|qpos|proprio|state|position", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class JointColumns:
         DatasetError
             If a name or unit does not fit.
         """
-        final = _names(feature, names, robot)
+        final = names_of(feature, names, robot)
         return cls(feature, final, _units(feature, final, units, robot))
 
     @property
@@ -94,34 +98,68 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
     raise DatasetError(
         f"there are no {wanted}: none of {list(usual[joints])} is a column. Say which holds "
         f"them, joints=... (--joints), of {sorted(layout.features)}",
+        check="joints",
         file="meta/info.json",
     )
 
 
-def _names(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ...] | None:
-    """Name of each value: the robot's where it is a joint of it, else the data set's."""
-    names = feature.names
-    if isinstance(given, Mapping):
-        for name in given:
+def commanded_joints(layout: Layout, key: str) -> Iterator[Finding]:
+    """What is said where nobody chose the joints, and those of ``key`` are commanded."""
+    if key not in COMMANDED:
+        return
+    others = [
+        other
+        for other, feature in layout.features.items()
+        if other not in (*JOINT_FEATURES, *BOOKKEEPING, ENVIRONMENT)
+        and feature.dtype.startswith("float")
+        and (feature.width == layout.features[key].width or LIKE_JOINTS.search(other))
+    ]
+    hint = f"; {others} may hold them" if others else ""
+    yield Finding(
+        "joints",
+        f"{key!r} is read, commands, as no measured joints have a usual name, {MEASURED}{hint}",
+        f"Say which are meant: joints={(others or [key])[0]!r} (--joints)",
+        (key, *others),
+    )
+
+
+def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ...] | None:
+    """Name of each value: the robot's where it is a joint of it, else the data set's.
+
+    Raises
+    ------
+    DatasetError
+        If they are not told apart, or do not fit what is ``given`` or the robot.
+    """
+    names, count = feature.names, feature.width
+    if given == "robot":
+        if robot is None:
+            raise DatasetError("joint_names='robot' needs a robot", column=feature.key)
+        given = tuple(robot.joint_names)
+    if isinstance(given, Mapping) or given is None:
+        if feature.misnamed:
+            message = f"its values cannot be told apart: {feature.misnamed}. {NAME_ALL}"
+            raise DatasetError(message, check="joints", column=feature.key)
+        for name in given or ():
             if name not in (names or ()):
                 message = f"joint_names has {name!r}; the values are called {names}"
                 raise DatasetError(message, column=feature.key)
-        names = tuple(given.get(name, name) for name in names or ())
-    elif given is not None:
+        names = names and tuple((given or {}).get(name, name) for name in names)
+    else:
         names = (given,) if isinstance(given, str) else tuple(given)
-    if names is not None and (len(names) != feature.width or len(set(names)) < len(names)):
-        message = f"joint_names must give {feature.width} different names, got {names}"
+    if names is not None and (len(names) != count or len(set(names)) < count):
+        message = f"joint_names must give {count} different names, got {len(names)}: {names}"
         raise DatasetError(message, column=feature.key)
     if robot is None:
         return names
+    if names is None and count == len(robot.joint_names) == 1:
+        names = tuple(robot.joint_names)
     if names is None:
-        if len(robot.joint_names) != feature.width:
-            raise DatasetError(
-                f"the metadata do not name its {feature.width} values, and the robot has "
-                f"{len(robot.joint_names)} joints: name all values, joint_names=[...]",
-                column=feature.key,
-            )
-        return tuple(robot.joint_names)
+        message = (
+            f"the set does not name its {count} values, and nothing else tells which are the "
+            f"robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}. {NAME_ALL}"
+        )
+        raise DatasetError(message, column=feature.key)
     matched = match_names(robot.joint_names, names, feature.key)
     return tuple(matched.get(name, name) for name in names)
 

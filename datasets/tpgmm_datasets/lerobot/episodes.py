@@ -15,7 +15,7 @@ import pyarrow as pa
 from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, summed_up
 from tpgmm_datasets.lerobot.files import METADATA_KEY
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
-from tpgmm_datasets.lerobot.parquet import episode_tables, open_parquet
+from tpgmm_datasets.lerobot.parquet import MOST_IN_EPISODE, episode_tables, open_parquet
 from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
 __all__ = ["EpisodeRows", "Policy", "Relaxed", "read_episodes"]
@@ -111,7 +111,7 @@ def _read_file(
 ) -> Iterator[EpisodeRows]:
     keys = [feature.key for feature in features]
     expected = {episode.index: episode for episode in episodes}
-    listed = {episode.index for episode in layout.episodes if episode.file == file}
+    listed = {one.index: one.length for one in layout.episodes if one.file == file}
     seen: set[int] = set()
     path, needed = layout.root / file, ["episode_index", *keys]
     with open_parquet(path, layout.root, needed, BOOKKEEPING) as parquet:
@@ -119,6 +119,14 @@ def _read_file(
         for problem in _declaration_problems(layout, file, schema.metadata or {}):
             policy(problem)
         counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
+        values = len(counters) + sum(feature.width for feature in features)
+        rows, longest = parquet.metadata.num_rows, max(listed.values())
+        if (longest + max(rows - sum(listed.values()), 0)) * values > MOST_IN_EPISODE:
+            message = (
+                f"it has {rows} rows of {values} values, for episodes of at most {longest}; of "
+                f"one at most {MOST_IN_EPISODE} values are read"
+            )
+            raise DatasetError(message, check="metadata", file=file)
         columns = list(dict.fromkeys([*counters, *keys]))
         for index, table in episode_tables(parquet, file, columns):
             if index in seen:

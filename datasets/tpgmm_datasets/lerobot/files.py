@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-__all__ = ["METADATA_KEY", "file_path", "free_place", "write_tables"]
+__all__ = ["METADATA_KEY", "chunked_files", "file_path", "free_place", "write_tables"]
 
 #: Under this key the data files repeat what ``info.json`` declares, so that an edit of the
 #: one is noticed by the other.
@@ -18,6 +18,11 @@ METADATA_KEY = b"tpgmm_datasets"
 def file_path(template: str, chunk: int, file: int) -> str:
     """The path of a file, of a ``template`` with ``chunk_index`` and ``file_index``."""
     return template.format(chunk_index=chunk, file_index=file)
+
+
+def chunked_files(folder: Path) -> list[Path]:
+    """The parquet files in the chunks of a folder; what begins with a dot is none of them."""
+    return sorted(folder.glob("[!.]*/[!.]*.parquet"))
 
 
 def free_place(root: Path, template: str, chunk_files: int) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.files import chunked_files
 from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_datasets.names import value_names
 from tpgmm_torch.atomic import read_whole
@@ -54,9 +55,11 @@ class Feature:
     shape : tuple of int
         Shape of one row's value.
     names : tuple of str or None
-        One name per value; None where the metadata name none or another number of them.
+        One name per value; None where the metadata name none, or not so that it can be used.
     units : tuple of str or None
         One unit per value, where the metadata tell (those of this project's writer do).
+    misnamed : str
+        Why the names cannot be used.
     """
 
     key: str
@@ -64,6 +67,7 @@ class Feature:
     shape: tuple[int, ...]
     names: tuple[str, ...] | None = None
     units: tuple[str, ...] | None = None
+    misnamed: str = ""
 
     @property
     def width(self) -> int:
@@ -242,17 +246,16 @@ def _feature(key: str, entry: Any) -> Feature:
         raise DatasetError(message, file=INFO, column=key)
     extra = entry.get("info")
     units = extra.get("units") if isinstance(extra, dict) else None
-    return Feature(
-        key,
-        dtype,
-        tuple(sizes),
-        value_names(entry.get("names"), width),
-        value_names(units, width, distinct=False),
-    )
+    names, misnamed = value_names(entry.get("names"), width, key)
+    listed, wrong = value_names(units, width, distinct=False)
+    if wrong:
+        message = f"its units cannot be used, {wrong}: mend them, or leave them out"
+        raise DatasetError(message, file=INFO, column=key)
+    return Feature(key, dtype, tuple(sizes), names, listed, misnamed)
 
 
 def _episodes_v3(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    files = chunked_files(root / "meta" / "episodes")
     if not files:
         message = (
             "there is no list of episodes: the set was never finalised "
@@ -368,7 +371,7 @@ def _contradictions(
             message = f"its task {task!r} is not among the tasks of the set, {list(tasks)}"
             yield DatasetError(message, check="metadata", episode=one.index)
     listed = {episode.file for episode in episodes}
-    for path in sorted((root / "data").glob("*/*.parquet")):
+    for path in chunked_files(root / "data"):
         if path.relative_to(root) not in listed:
             message = (
                 "no episode of the metadata lies in this file: it is a left-over of another "

@@ -15,10 +15,14 @@ import pyarrow.parquet as pq
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_torch.atomic import open_whole
 
-__all__ = ["episode_tables", "open_parquet", "read_columns"]
+__all__ = ["MOST_IN_EPISODE", "episode_tables", "open_parquet", "read_columns"]
 
 #: Rows that are decoded at a time: what bounds the memory of an iteration.
 BATCH_ROWS = 1 << 16
+#: Rows times columns of what is read whole, and rows times values of an episode: beyond, the
+#: memory would fill, however small the file is.
+MOST_READ = 2_000_000
+MOST_IN_EPISODE = 20_000_000
 
 
 @contextmanager
@@ -79,7 +83,11 @@ def open_parquet(
 
 def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
     """Read some columns of a parquet file whole; errors are those of ``open_parquet``."""
-    with open_parquet(path, root, columns) as parquet, _named(path.relative_to(root)):
+    file = path.relative_to(root)
+    with open_parquet(path, root, columns) as parquet, _named(file):
+        if (rows := parquet.metadata.num_rows) * len(columns) > MOST_READ:
+            message = f"it has {rows} rows; at most {MOST_READ // len(columns)} are read"
+            raise DatasetError(message, file=file)
         table = parquet.read(columns=list(columns), use_threads=False).select(list(columns))
         table.validate(full=True)
         return table

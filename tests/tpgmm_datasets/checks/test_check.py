@@ -157,13 +157,23 @@ def test_copies_are_named_with_the_first():
     [finding] = check([*shown, shown[1], shown[1]])
     assert finding.episodes == (4, 5) and "demonstration 4 is a copy of 1" in finding.message
     still = replace(shown[0], joints=0 * shown[0].joints)
-    assert checks([still, still]) == []
+    assert checks([still, still]) == [("still", ())]
 
 
-def test_a_motion_played_backwards_is_unlike_the_others():
-    shown = waves(6)
-    shown[3] = replace(shown[3], joints=shown[3].joints.flip(0))
-    assert checks(shown) == [("episodes", (3,))]
+@pytest.mark.parametrize(("count", "reversed_"), [(3, [2]), (4, [0]), (6, [3]), (9, [1, 2, 6])])
+def test_motions_that_run_backwards_among_others_are_named(count, reversed_):
+    shown = waves(count)
+    for n in reversed_:
+        shown[n] = replace(shown[n], joints=shown[n].joints.flip(0))
+    [finding] = check(shown)
+    assert (finding.check, finding.episodes) == ("episodes", tuple(reversed_))
+    assert "backwards" in finding.message
+
+
+def test_there_and_back_has_no_direction():
+    there = [replace(d, joints=torch.cat((d.joints, d.joints.flip(0)))[::2]) for d in waves(6)]
+    there[3] = replace(there[3], joints=there[3].joints.flip(0))
+    assert checks(there) == []
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -183,7 +193,7 @@ def test_the_sign_of_a_quaternion_makes_no_outlier(named):
 
 def test_joints_that_hardly_move_count_little():
     wider = [
-        Demonstration(d.time, np.hstack((d.joints, np.full((len(d), 1), 0.1 * (n == 2)))))
+        Demonstration(d.time, np.hstack((d.joints, 1e-3 * d.joints[:, :1] + 0.1 * (n == 2))))
         for n, d in enumerate(waves(6))
     ]
     assert checks(wider) == []

@@ -1,5 +1,7 @@
 """Units, order, limits and speeds of joint vectors, with the names and numbers in messages."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -56,5 +58,17 @@ def test_a_stuck_joint_needs_others_that_move():
     ]
     [finding] = (one for one in check(items) if one.check == "stuck")
     assert (finding.episodes, finding.names) == ((2,), ("joint 1",))
+
+
+def test_joints_that_never_move_are_named_but_not_coordinates_of_tracked_hands():
+    path = np.sin(TIME)[:, None]
     idle = [Demonstration(TIME, np.hstack((path, 0 * path)) + 0.01 * n) for n in range(5)]
-    assert list(check(idle)) == []
+    [finding] = check(idle)
+    assert (finding.check, finding.names) == ("still", ("joint 1",))
+    assert "never move" in finding.message
+    moves = replace(idle[3], joints=idle[3].joints + 1e-6 * torch.as_tensor(path))
+    assert list(check([*idle, moves])) == []
+    plane = [
+        Demonstration(TIME, np.hstack((path, 2 * path, 0 * path)) + n / 99) for n in (1, 2)
+    ]
+    assert list(check(plane, Poses(("hand",), orientation=False))) == []

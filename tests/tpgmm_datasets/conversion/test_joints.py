@@ -12,17 +12,23 @@ from tests.support.lerobot_sets import (
     to_v21,
 )
 from tpgmm_datasets import DatasetError, load_lerobot
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 
-@pytest.mark.parametrize("names", [None, ["state"], [1, 2, 3], ["a", "a", "b"]])
-def test_names_that_name_nothing_count_as_missing(root, tmp_path, names):
+@pytest.mark.parametrize("names", [None, [], {}, ["state"]])
+def test_a_set_without_names_has_the_robots_only_if_somebody_says_so(root, tmp_path, names):
     plain = to_v21(root, tmp_path / "plain")
     change_info(plain, lambda i: i["features"]["observation.state"].update(names=names))
     assert load_lerobot(plain)[0].joint_names is None
     assert load_lerobot(plain, joint_names=["x", "y", "z"])[0].joint_names == ("x", "y", "z")
-    assert load_lerobot(plain, robot=Arm("a", "b", "c"))[0].joint_names == ("a", "b", "c")
-    with pytest.raises(DatasetError, match="name all values"):
-        load_lerobot(plain, robot=Arm("a", "b"))
+    robot = Arm("a", "b", "c")
+    with pytest.raises(DatasetError, match=r"does not name its 3 values.*--joint-name robot"):
+        load_lerobot(plain, robot=robot)
+    assert load_lerobot(plain, robot=robot, joint_names="robot")[0].joint_names == tuple("abc")
+    with pytest.raises(DatasetError, match="3 different names, got 2"):
+        load_lerobot(plain, robot=Arm("a", "b"), joint_names="robot")
+    with pytest.raises(DatasetError, match="needs a robot"):
+        load_lerobot(plain, joint_names="robot")
 
 
 def test_a_mapping_names_the_joints_that_are_called_otherwise(root):
@@ -45,6 +51,31 @@ def test_the_joint_feature_is_found_or_chosen(root):
         root, lambda i: i["features"].update(state=i["features"].pop("observation.state"))
     )
     assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def renamed(root, name):
+    """The measured joints under another name."""
+    change_table(
+        root,
+        DATA,
+        lambda t: t.rename_columns(
+            [name if n == "observation.state" else n for n in t.column_names]
+        ),
+    )
+    change_info(
+        root, lambda i: i["features"].update({name: i["features"].pop("observation.state")})
+    )
+
+
+@pytest.mark.parametrize("name", ["observation.states.joint.position", "measured", "arm.qpos"])
+def test_commands_in_place_of_an_unusual_state_are_told_once(root, name):
+    renamed(root, name)
+    with pytest.warns(PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'") as told:
+        commands = joints_of(load_lerobot(root))
+    assert len(told) == 1
+    assert_equal(joints_of(load_lerobot(root, joints="commanded")), commands)
+    measured = joints_of(load_lerobot(root, joints=name))
+    assert_equal([m[1:] for m in measured], [c[:-1] for c in commands])
 
 
 def test_commanded_joints_need_actions(root):

@@ -2,6 +2,7 @@
 
 import os
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -76,3 +77,24 @@ def test_what_stands_in_place_of_a_file_is_told(root, place, message, file):
     with pytest.raises(DatasetError, match="no meta/info.json|" + message) as caught:
         load_lerobot(root)
     assert caught.value.check == "missing"
+
+
+@pytest.mark.parametrize("beside", ["._file-000.parquet", ".file.parquet", ".tmp/file.parquet"])
+@pytest.mark.parametrize("file", [DATA, EPISODES])
+def test_what_begins_with_a_dot_is_no_part_of_a_set(root, beside, file):
+    expected = joints_of(load_lerobot(root))
+    path = (root / file).parents[beside.count("/")] / beside
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"Mac OS X")
+    assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+@pytest.mark.parametrize(
+    ("file", "told"), [(DATA, "at most 20000000"), (EPISODES, "at most 285714")]
+)
+def test_files_of_too_many_rows_are_refused_before_they_are_read(root, file, told, monkeypatch):
+    table = pq.read_table(root / file).slice(0, 1).replace_schema_metadata(None)
+    pq.write_table(table.take(np.zeros(1_500_000, int)), root / file)
+    monkeypatch.setattr(pq.ParquetFile, "iter_batches" if file == DATA else "read", None)
+    with pytest.raises(DatasetError, match=f"{file}: it has 1500000 rows.*{told}"):
+        load_lerobot(root)

@@ -54,7 +54,7 @@ def uploaded(
     DataError
         If these are no such files.
     """
-    paths = sorted(Path(file) for file in files)
+    paths = sorted(path for path in map(Path, files) if not path.name.startswith("."))
     kinds = {path.suffix.lower() for path in paths}
     if kinds == {".zip"} and len(paths) == 1:
         with TemporaryDirectory() as place:

@@ -54,7 +54,8 @@ class DataOptions:
         The feature that holds the joints, or 'measured' or 'commanded'; default
         observation.state or the like.
     joint_name : ``STORED=JOINT``
-        The robot's name of a stored joint, repeatable, where the names differ.
+        The robot's name of a stored joint, repeatable, where the names differ; NAME,NAME,...
+        names all values in order, 'robot' says that they are the robot's joints in its order.
     rate : float >= 0.001
         Resample to this number of steps per second.
     relax : ``CHECK``
