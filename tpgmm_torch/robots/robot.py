@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, Self
@@ -17,7 +18,12 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    PlausibilityWarning,
+    ShapeError,
+    UnknownNameError,
+)
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
@@ -96,6 +102,12 @@ class Robot(Described):
         UnknownNameError
             If a link or a joint is not in the URDF.
 
+        Warns
+        -----
+        PlausibilityWarning
+            If limits of the joint vector cannot be, like ``velocity="0"``, if a joint mimics
+            what does not move, or if macros are left over: these are passed over.
+
         Examples
         --------
         >>> urdf = '''<robot name="lift"><link name="base"/><link name="hand"/>
@@ -122,7 +134,9 @@ class Robot(Described):
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
             "dtype": str(dtype).removeprefix("torch."),
         }
-        return cls(model, config, device)
+        robot = cls(model, config, device)
+        robot._tell_doubts()
+        return robot
 
     @classmethod
     def from_mjcf(
@@ -264,7 +278,9 @@ class Robot(Described):
         options: dict[str, Any] = _side_by_side(robots)
         first = next(iter(robots.values())).lower
         options |= {"base": base, "dtype": first.dtype, "device": first.device}
-        return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
+        with warnings.catch_warnings():  # each has told its own doubts
+            warnings.simplefilter("ignore", PlausibilityWarning)
+            return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -293,11 +309,29 @@ class Robot(Described):
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
             limits, self.without_limits = _limits(model, self.joint_names)
+            self.doubtful = tuple(n for n in self.without_limits if model.joint[n].doubts)
             self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
                 **options
             )
             self.forward_kinematics = TreeKinematics(
                 self.tree, len(self.links), self.n_joints, **options
+            )
+
+    def _tell_doubts(self) -> None:
+        """Warn once of all that was passed over and concerns the joint vector."""
+        joints = (self.model.joint.get(name) for name in self.joint_names)
+        said = {j.name: f"{j.name!r}: {' '.join(j.doubts)}" for j in joints if j and j.doubts}
+        if found := [*said.values(), *self.model.doubts]:
+            bounds = {"velocity": dict.fromkeys(said, 1.0)}
+            remedy = (
+                f", or give bounds where it moves: Controller(..., {bounds=}), in a policy "
+            )
+            remedy += "--policy.control.velocity"
+            warnings.warn(
+                f"the URDF of {self.model.name!r} says what cannot be, and it is passed over: "
+                f"{'; '.join(found)}. Correct the URDF{remedy if said else ''}",
+                PlausibilityWarning,
+                stacklevel=3,
             )
 
     def state(self, joints: Any) -> RobotState:
@@ -329,7 +363,7 @@ class Robot(Described):
         device = self.lower.device if device is None else torch.device(device)
         if name == self._config["dtype"] and device == self.lower.device:
             return self
-        return self.from_config({**self._config, "dtype": name}, device)
+        return type(self)(self.model, {**self._config, "dtype": name}, device)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
@@ -344,7 +378,7 @@ class Robot(Described):
     def _root(self) -> Frame:
         """Where the root of the description is in the frame of the base, which it must hold."""
         config = self._config | {"links": [self.model.root], "dtype": "float64"}
-        state = self.from_config(config).state(torch.zeros(self.n_joints))
+        state = type(self)(self.model, config, "cpu").state(torch.zeros(self.n_joints))
         if state.jacobians.any():
             raise DataError(
                 f"the base {config['base']!r} of a robot is moved by its joints: give it one "
@@ -535,10 +569,7 @@ def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[fl
     Limits that leave it a single point, as where a sign was forgotten, are none: the answer
     is False.
     """
-    try:
-        leader = model.leader(joint.name)
-    except TPGMMError:  # raised where it matters: for a link that depends on it
-        return True
+    leader = model.leader(joint.name)
     if leader.joint not in rows or leader.multiplier == 0:
         return True
     row, factor = rows[leader.joint], leader.multiplier
@@ -546,12 +577,6 @@ def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[fl
     row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
     ends = sorted((end - leader.offset) / factor for end in (joint.lower, joint.upper))
     low, high = max(row[0], ends[0]), min(row[1], ends[1])
-    if low > high + 1e-9:
-        raise DataError(
-            f"the limits of joint {joint.name!r}, {joint.lower:g} to {joint.upper:g}, "
-            f"leave no room to {leader.joint!r}, which it mimics as {factor:g} * "
-            f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
-        )
     if high - low < 1e-9 < row[1] - row[0]:
         return False
     row[:2] = low, high
