@@ -51,6 +51,7 @@ XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf
 PASSED_OVER = re.compile(
     r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|[\0-\x08\x0b\x0c\x0e-\x1f]", re.DOTALL
 )
+UNEXPANDED = re.compile(r"\$[{(]")
 #: An ampersand that begins none of XML's own references.
 AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 #: What may stand before the first element of a text: a byte order mark, and space.
@@ -255,16 +256,18 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         joints = tuple(map(_joint, root.findall("joint")))
         base = _root_link(links, joints)
     except TPGMMError as error:
-        raise (DataError(f"{XACRO}; {error}") if macros or "${" in text else error) from None
+        raise (
+            DataError(f"{XACRO}; {error}") if macros or UNEXPANDED.search(text) else error
+        ) from None
     doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
-    mimicry = {each.name: each.mimic and each.mimic.joint for each in joints if each.movable}
+    mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
     if lost := [name for name, leader in mimicry.items() if leader and _lost(mimicry, name)]:
         joints = tuple(replace(j, mimic=None) if j.name in lost else j for j in joints)
         doubts.append(f"mimicry of what does not move, or in a circle, by {', '.join(lost)}")
     return UrdfModel(root.get("name", ""), text, base, links, joints, tuple(doubts))
 
 
-def _lost(mimicry: Mapping[str, str | None], name: str) -> bool:
+def _lost(mimicry: Mapping[str, str], name: str) -> bool:
     """Whether a joint mimics none that moves, or in the end itself."""
     way = [mimicry[name]]
     while way[-1] in mimicry and len(way) <= len(mimicry):
