@@ -16,19 +16,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch import operators as builtin_operators
 from tpgmm_torch.atomic import consistent, read_whole, replacing
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import ModelFileError
+from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError, TPGMMError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -43,7 +47,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save"]
+__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "tried"]
 
 #: Files of a model.
 FILES = CONFIG, TENSORS = "config.json", "model.safetensors"
@@ -61,6 +65,10 @@ KNOWN: dict[str, type] = {
 }  # fmt: skip
 #: What an estimator has learned, as :meth:`TaskParameterizedGMM.from_parameters` takes it.
 LEARNING = "n_iter_", "converged_", "lower_bound_"
+#: Times at which a model is run when it is loaded.
+TRIED = 8
+#: Numbers of a mixture are smaller: beyond it, products of Gaussians lose all digits.
+LARGEST = 1e12
 LEARNED = ("weights", "means", "covariances", "time", "holds", "n_demonstrations")
 
 
@@ -148,7 +156,7 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
             f"{path} cannot be loaded onto the device {device!r}: "
             f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
         ) from error
-    return decode(config["model"], custom, on_device)
+    return tried(decode(config["model"], custom, on_device))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -322,30 +330,36 @@ def decode(
     ModelFileError
         If a class is not known or does not take these fields.
     """
-    try:
-        return _decoded(description, custom, tensors or {})
-    except ModelFileError:
-        raise
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ModelFileError(f"the model does not fit together: {error!r}") from error
+    return _decoded(description, "model", custom, tensors or {})
 
 
 def _decoded(
-    description: Any, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
+    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
-    if isinstance(description, list):
-        return tuple(_decoded(each, custom, tensors) for each in description)
-    if not isinstance(description, Mapping):
-        return description
-    if "float" in description:
-        return float(description["float"])
-    if "tensor" in description:
-        return tensors[description["tensor"]]
-    if "config" in description:  # of a class, which reads it itself
-        return _rebuilt(dict(description), custom)
-    fields = description.get("mapping", description)
-    given = {key: _decoded(each, custom, tensors) for key, each in fields.items()}
-    return given if "mapping" in description else _rebuilt(given, custom)
+    """What an entry describes; whatever does not fit there is an error that names it."""
+
+    def inner(name: object, each: Any) -> Any:
+        return _decoded(each, f"{entry}.{name}", custom, tensors)
+
+    try:
+        if isinstance(description, list):
+            return tuple(inner(number, each) for number, each in enumerate(description))
+        if not isinstance(description, Mapping):
+            return description
+        if "float" in description:
+            return float(description["float"])
+        if "tensor" in description:
+            return tensors[description["tensor"]]
+        if "config" in description:  # of a class, which reads it itself
+            return _rebuilt(dict(description), custom)
+        fields = description.get("mapping", description)
+        given = {key: inner(key, each) for key, each in fields.items()}
+        return given if "mapping" in description else _rebuilt(given, custom)
+    except ModelFileError:
+        raise
+    except Exception as error:  # of classes and shapes that do not go together, of any kind
+        said = error if isinstance(error, TPGMMError) else repr(error)
+        raise ModelFileError(f"the entry {entry!r} does not fit together: {said}") from error
 
 
 def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
@@ -364,7 +378,83 @@ def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
         return kind.from_config(given["config"])
     if (summary := given.get("summary")) is not None:
         given["summary"] = summary(given.get("robot") or given["kinematics"])
-    return REBUILT.get(kind, kind)(**given)
+    for key, wanted in get_type_hints(kind).items() if is_dataclass(kind) else ():
+        if key in given and not _fits(given[key], wanted):
+            raise DataError(f"{key} is {str(given[key])[:60]!r}, not of the type {wanted}")
+    made = REBUILT.get(kind, kind)(**given)
+    if isinstance(made, TaskParameterizedGMM | Regression):
+        _check(made if isinstance(made, Regression) else made.skill)
+    return made
+
+
+def _fits(value: Any, wanted: Any) -> bool:
+    """Whether a value is of an annotated type."""
+    origin, inner = get_origin(wanted), get_args(wanted)
+    if origin in (Union, UnionType):
+        return any(_fits(value, each) for each in inner)
+    if origin is abc.Mapping:
+        return isinstance(value, dict) and all(_fits(each, inner[1]) for each in value.values())
+    if origin in (tuple, abc.Sequence):
+        if not isinstance(value, tuple):
+            return False
+        of = inner if origin is tuple and inner[-1] is not ... else inner[:1] * len(value)
+        return len(of) == len(value) and all(map(_fits, value, of))
+    if wanted is float:
+        return isinstance(value, float | int) and not isinstance(value, bool)
+    return wanted is Any or not isinstance(wanted, type) or isinstance(value, wanted)
+
+
+def _check(skill: Regression) -> None:
+    """Refuse numbers that do not belong to the operators and the robot, by their names."""
+    robot, count = skill.kinematics, len(skill.log_weights)
+    named = {"log_weights": (skill.log_weights, (count,))}
+    named |= {
+        f"peaks.{i}": (peak, (robot.n_joints,)) for i, peak in enumerate(skill.peaks or ())
+    }
+    named["time"] = skill.time, (max(len(skill.time), 2),)
+    for j, (one, operator) in enumerate(zip(skill.conditionals, skill.operators, strict=True)):
+        size = operator.dimension(robot)
+        shapes = (count, size), (count, size), (count, size, size), (count,), (count,)
+        for (name, value), shape in zip(vars(one).items(), shapes, strict=True):
+            named[f"{name} of operator {j}"] = value, shape
+        gaussians.cholesky(one.covariance, f"the covariance of operator {j}")
+        if not (one.time_variance > 0).all():
+            raise DataError(f"time_variance of operator {j} is not positive")
+    for name, (value, shape) in named.items():
+        kind = value.dtype, tuple(value.shape)
+        if kind != (robot.lower.dtype, shape) or not (value.abs() < LARGEST).all():
+            raise ShapeError(f"{name} is {kind}, not {robot.lower.dtype} of {shape}, finite")
+    bounds = skill.motion_bounds
+    if bounds is not None and len(bounds.lower) != robot.n_joints:
+        raise ShapeError(f"motion_bounds are of {len(bounds.lower)} joints")
+    if not (skill.time.diff() > 0).all():
+        raise DataError("time does not increase")
+
+
+def tried(model: Any) -> Any:
+    """A model or a skill as it is, once it has been run.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM, or Skill
+
+    Raises
+    ------
+    ModelFileError
+        If it cannot be run.
+    """
+    skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
+    robot, times = skill.kinematics, skill.time[:: max(len(skill.time) // TRIED, 1)]
+    joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper)
+    joints[list(robot.quaternion_starts)] = 1.0
+    joints = joints.expand(len(times), -1)
+    frames = {name: Frame(torch.zeros(3).to(joints)) for name in skill.frame_names}
+    try:
+        with torch.no_grad():
+            skill.start(joints, frames).estimate(times, joints, frames)
+    except Exception as error:
+        raise ModelFileError(f"the model cannot be run: {error!r}") from error
+    return model
 
 
 def _estimator(learning: Mapping[str, Any], **given: Any) -> TaskParameterizedGMM:

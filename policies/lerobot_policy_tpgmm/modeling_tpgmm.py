@@ -47,7 +47,7 @@ from tpgmm_torch.exceptions import (
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.persistence import decode, encode, tried
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -661,6 +661,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         except (DecodingError, ParsingError, FileNotFoundError) as error:
             raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
         policy = cls(config, model=model, **options).eval().to(config.device)
+        tried(policy.skill)  # with the settings of the configuration
         # LeRobot passes none of this on to a policy: who starts it must compare
         log.info(
             "observation.state is taken as %s; actions are %s, %g per second (--fps)",
