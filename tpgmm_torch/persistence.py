@@ -164,10 +164,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Configuration and tensors of a folder, of which nothing was cut off or changed."""
     config = _parsed(path / CONFIG, json.loads)
     if not isinstance(config, dict) or config.get("format") != FORMAT["format"]:
-        raise ModelFileError(
-            f"{path / CONFIG} describes no model; a LeRobot policy is loaded with "
-            "TPGMMPolicy.from_pretrained(path)"
-        )
+        kind = config.get("type") if isinstance(config, dict) else None
+        hint = f": it is a LeRobot policy of type {kind!r}, opened by its from_pretrained(path)"
+        hint += f"; of a TPGMMPolicy, {path / 'model'} is the model" if kind == "tpgmm" else ""
+        raise ModelFileError(f"{path / CONFIG} describes no model{hint if kind else ''}")
     if config.get("version") != FORMAT["version"]:
         raise ModelFileError(
             f"{path} has format version {config.get('version')!r}, this release reads "
@@ -185,7 +185,9 @@ def _parsed[T](file: Path, parse: Callable[[bytes], T]) -> T:
     try:
         return parse(read_whole(file))
     except (FileNotFoundError, NotADirectoryError):
-        raise ModelFileError(f"{file.parent} is not a saved model: {file} is missing") from None
+        hint = ". Give the folder, not a file in it" if file.parent.is_file() else ""
+        message = f"{file.parent} is not a saved model: {file} is missing{hint}"
+        raise ModelFileError(message) from None
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError, MemoryError) as e:
         raise ModelFileError(f"{file} cannot be read: {e}") from e
 
