@@ -4,7 +4,11 @@ import copy
 import json
 import math
 import pickle
+import random
+import re
 import time
+import warnings
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -41,6 +45,33 @@ from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
+from tpgmm_torch.robots.urdf import read_urdf
+
+
+def published() -> list[Any]:
+    """The URDFs of a public collection of which something moves; one file of it is empty."""
+    files = sorted(G1_PATH.parents[2].rglob("*.urdf"))
+    moves = re.compile(rb'type="(revolute|continuous|prismatic)"')
+    return [pytest.param(f, id=f.stem) for f in files if moves.search(f.read_bytes())]
+
+
+@pytest.mark.parametrize("file", published())
+def test_published_robots_are_where_pinocchio_has_them(file: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)
+        model = read_urdf(file)
+        links = random.Random(0).sample(model.links, min(3, len(model.links)))
+        robot = Robot.from_urdf(file, links)
+    leaders = {name: model.leader(name) for name in model.movable if name not in model.actuated}
+    followers = {n: (on.joint, on.multiplier, on.offset) for n, on in leaders.items()}
+    oracle = Pinocchio(pin.buildModelFromUrdf(str(file)), followers)
+    joints = random_joints(robot)
+    state = robot.state(joints)
+    oracle.run(dict(zip(robot.joint_names, joints.tolist(), strict=True)))
+    for index, link in enumerate(links):
+        position, _, jacobian = oracle.link(link, model.root, robot.joint_names)
+        np.testing.assert_allclose(state.position(link), position, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(state.jacobians[index], jacobian.reshape(6, -1), atol=1e-9)
 
 
 class TestOracles:
