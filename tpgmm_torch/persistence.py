@@ -157,7 +157,7 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
             f"{path} cannot be loaded onto the device {device!r}: "
             f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
         ) from error
-    return tried(decode(config["model"], custom, on_device))
+    return tried(decode(config.get("model"), custom, on_device))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -451,17 +451,17 @@ def tried(model: Any) -> Any:
     ModelFileError
         If it cannot be run.
     """
-    skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
-    robot, times = skill.kinematics, skill.time[:: max(len(skill.time) // TRIED, 1)]
-    joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper)
-    joints[list(robot.quaternion_starts)] = 1.0
-    joints = joints.expand(len(times), -1)
-    frames = {name: Frame(torch.zeros(3).to(joints)) for name in skill.frame_names}
     try:
+        skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
+        robot, times = skill.kinematics, skill.time[:: max(len(skill.time) // TRIED, 1)]
+        joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper)
+        joints[list(robot.quaternion_starts)] = 1.0
+        joints = joints.expand(len(times), -1)
+        frames = {name: Frame(torch.zeros(3).to(joints)) for name in skill.frame_names}
         with torch.no_grad():
             skill.start(joints, frames).estimate(times, joints, frames)
     except Exception as error:
-        raise ModelFileError(f"the model cannot be run: {error!r}") from error
+        raise ModelFileError(f"{str(model)[:60]} cannot be run: {error!r}") from error
     return model
 
 

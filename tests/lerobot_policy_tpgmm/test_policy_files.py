@@ -53,7 +53,7 @@ def test_the_directory_contains_a_model_in_its_own_format(saved):
     assert model.kinematics_ == small_bottle().kinematics_
     with pytest.raises(ModelFileError, match=r"LeRobot policy of type 'tpgmm', .*from_pre"):
         load(saved)
-    with pytest.raises(ModelFileError, match="model, not a policy: tpgmm_torch.load"):
+    with pytest.raises(ModelFileError, match=r"a model, not a policy: tpgmm_torch\.load"):
         TPGMMPolicy.from_pretrained(saved / "model")
 
 
