@@ -226,9 +226,7 @@ def parse_xml(text: str) -> ElementTree.Element:
     try:
         parser.Parse(AMPERSAND.sub("&amp;", PASSED_OVER.sub("", text)).lstrip(), True)
         return builder.close()
-    except DataError:
-        raise
-    except (expat.ExpatError, ValueError) as error:
+    except (expat.ExpatError, UnicodeError) as error:
         raise DataError(f"the description is not well-formed XML: {error}") from error
 
 
@@ -256,9 +254,9 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         joints = tuple(map(_joint, root.findall("joint")))
         base = _root_link(links, joints)
     except TPGMMError as error:
-        raise (
-            DataError(f"{XACRO}; {error}") if macros or UNEXPANDED.search(text) else error
-        ) from None
+        if macros or UNEXPANDED.search(text):
+            raise DataError(f"{XACRO}; {error}") from error
+        raise
     doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
     mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
     if lost := [name for name, leader in mimicry.items() if leader and _lost(mimicry, name)]:
@@ -335,7 +333,6 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
     """
     limit = element.find("limit")
     given = {} if limit is None else limit.attrib
-    limits, doubts = dict[str, Any](), list[str]()
 
     def number(key: str, default: float) -> float:
         try:
@@ -343,17 +340,15 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
         except ValueError:
             return math.nan
 
-    for key in ("velocity", "acceleration", "deceleration", "jerk"):
-        if (rate := number(key, math.inf)) > 0:
-            limits[key] = rate
-        else:
-            doubts.append(f'{key}="{given[key][:20]}"')
-    slowing = limits.pop("deceleration", math.inf)
-    limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
+    rates = ("velocity", "acceleration", "deceleration", "jerk")
+    limits: dict[str, Any] = {key: number(key, math.inf) for key in rates}
+    doubts = [f'{key}="{given[key][:20]}"' for key in rates if not limits[key] > 0]
+    limits = {key: rate if rate > 0 else math.inf for key, rate in limits.items()}
+    limits["acceleration"] = min(limits["acceleration"], limits.pop("deceleration"))
     low, high = number("lower", 0.0), number("upper", 0.0)
     if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
         # CAD programs write zeros where nobody has filled in anything
-        if low < high or (low == high and "velocity" in limits):
+        if low < high or (low == high and number("velocity", math.inf) > 0):
             limits |= {"lower": low, "upper": high}
         else:
             doubts.append(f'lower="{given.get("lower", 0)}" upper="{given.get("upper", 0)}"')
