@@ -9,10 +9,11 @@ not fit together.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 from collections import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -66,10 +67,8 @@ KNOWN: dict[str, type] = {
 }  # fmt: skip
 #: What an estimator has learned, as :meth:`TaskParameterizedGMM.from_parameters` takes it.
 LEARNING = "n_iter_", "converged_", "lower_bound_"
-#: Times at which a model is run when it is loaded.
-TRIED = 8
-#: Numbers of a mixture are smaller: beyond it, products of Gaussians lose all digits.
-LARGEST = 1e12
+#: What fields may hold that are annotated otherwise.
+ACCEPTED: dict[Any, Any] = {float: (float, int), Any: object, Skill: object}
 LEARNED = ("weights", "means", "covariances", "time", "holds", "n_demonstrations")
 
 
@@ -340,29 +339,34 @@ def _decoded(
     description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
     """What an entry describes; whatever does not fit there is an error that names it."""
-
-    def inner(name: object, each: Any) -> Any:
-        return _decoded(each, f"{entry}.{name}", custom, tensors)
-
     try:
-        if isinstance(description, list):
-            return tuple(inner(number, each) for number, each in enumerate(description))
-        if not isinstance(description, Mapping):
-            return description
-        if "float" in description:
-            return float(description["float"])
-        if "tensor" in description:
-            return tensors[description["tensor"]]
-        if "config" in description:  # of a class, which reads it itself
-            return _rebuilt(dict(description), custom)
-        fields = description.get("mapping", description)
-        given = {key: inner(key, each) for key, each in fields.items()}
-        return given if "mapping" in description else _rebuilt(given, custom)
+        return _entry(description, entry, custom, tensors)
     except ModelFileError:
         raise
     except Exception as error:  # of classes and shapes that do not go together, of any kind
         said = error if isinstance(error, TPGMMError) else repr(error)
         raise ModelFileError(f"the entry {entry!r} does not fit together: {said}") from error
+
+
+def _entry(
+    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
+) -> Any:
+    def inner(name: object, each: Any) -> Any:
+        return _decoded(each, f"{entry}.{name}", custom, tensors)
+
+    if isinstance(description, list):
+        return tuple(itertools.starmap(inner, enumerate(description)))
+    if not isinstance(description, Mapping):
+        return description
+    if "float" in description:
+        return float(description["float"])
+    if "tensor" in description:
+        return tensors[description["tensor"]]
+    if "config" in description:  # of a class, which reads it itself
+        return _rebuilt(dict(description), custom)
+    fields = description.get("mapping", description)
+    given = {key: inner(key, each) for key, each in fields.items()}
+    return given if "mapping" in description else _rebuilt(given, custom)
 
 
 def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
@@ -382,61 +386,59 @@ def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
     if (summary := given.get("summary")) is not None:
         given["summary"] = summary(given.get("robot") or given["kinematics"])
     made = REBUILT.get(kind, kind)(**given)
-    hints = get_type_hints(kind) if is_dataclass(kind) else {}
+    if KNOWN.get(name) is kind:
+        _check_fields(made, given)
+    return made
+
+
+def _check_fields(made: Any, given: Mapping[str, Any]) -> None:
+    """Refuse fields of other types, and numbers that do not belong together, by their names."""
+    hints = get_type_hints(type(made)) if is_dataclass(made) else {}
     for each in hints.keys() & given.keys():
         if not _fits(value := getattr(made, each), hints[each]):
             raise DataError(f"{each} is {str(value)[:60]!r}, not of the type {hints[each]}")
     if isinstance(made, TaskParameterizedGMM | Regression):
-        _check(made if isinstance(made, Regression) else made.skill)
-    return made
+        skill = getattr(made, "skill", made)
+        for name, value, shape in _numbers(skill):
+            if value.dtype not in (torch.float32, torch.float64) or value.shape != shape:
+                raise ShapeError(f"{name}: {value.dtype} of {tuple(value.shape)}, not {shape}")
+            # their squares have to be finite in float32, too
+            if not value.float().square().isfinite().all():
+                raise DataError(f"{name} holds NaN, or numbers that are too large")
+        if not (skill.time.diff() > 0).all():
+            raise DataError("time does not increase")
 
 
 def _fits(value: Any, wanted: Any) -> bool:
     """Whether a value is of an annotated type."""
-    origin, inner = get_origin(wanted), get_args(wanted)
+    origin, inner = get_origin(wanted) or wanted, get_args(wanted)
     if origin in (Union, UnionType):
         return any(_fits(value, each) for each in inner)
-    if origin is abc.Mapping:
-        return isinstance(value, dict) and all(_fits(each, inner[1]) for each in value.values())
     if origin in (tuple, abc.Sequence):
         if not isinstance(value, tuple):
             return False
-        of = inner if origin is tuple and inner[-1] is not ... else inner[:1] * len(value)
-        return len(of) == len(value) and all(map(_fits, value, of))
-    if wanted is Skill:
-        return hasattr(value, "estimate")
-    if wanted is float:
-        return isinstance(value, float | int) and not isinstance(value, bool)
-    return wanted is Any or not isinstance(wanted, type) or isinstance(value, wanted)
+        any_number = origin is not tuple or inner[-1] is ...
+        members = inner[:1] * len(value) if any_number else inner
+        return len(members) == len(value) and all(map(_fits, value, members))
+    return isinstance(value, ACCEPTED.get(origin, origin))
 
 
-def _check(skill: Regression) -> None:
-    """Refuse numbers that do not belong to the operators and the robot, by their names."""
+def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
+    """Names, values and wanted shapes of what a mixture computes with."""
     robot, count = skill.kinematics, len(skill.log_weights)
-    named: dict[str, tuple[Tensor, tuple[int, ...]]]
-    named = {"log_weights": (skill.log_weights, (count,))}
-    named |= {
-        f"peaks.{i}": (peak, (robot.n_joints,)) for i, peak in enumerate(skill.peaks or ())
-    }
-    named["time"] = skill.time, (max(len(skill.time), 2),)
+    yield "log_weights", skill.log_weights, (count,)
+    yield "time", skill.time, (max(len(skill.time), 2),)
+    for number, peak in enumerate(skill.peaks or ()):
+        yield f"peaks.{number}", peak, (robot.n_joints,)
+    if skill.motion_bounds is not None:
+        yield "motion_bounds", torch.zeros_like(skill.motion_bounds.lower), (robot.n_joints,)
     for j, (one, operator) in enumerate(zip(skill.conditionals, skill.operators, strict=True)):
         size = operator.dimension(robot)
         shapes = (count, size), (count, size), (count, size, size), (count,), (count,)
         for (name, value), shape in zip(vars(one).items(), shapes, strict=True):
-            named[f"{name} of operator {j}"] = value, shape
+            yield f"{name} of operator {j}", value, shape
         gaussians.cholesky(one.covariance, f"the covariance of operator {j}")
-        if not (one.time_variance > 0).all():
-            raise DataError(f"time_variance of operator {j} is not positive")
-    for name, (value, shape) in named.items():
-        if value.dtype not in (torch.float32, torch.float64) or value.shape != shape:
-            raise ShapeError(f"{name} is {value.dtype} of {tuple(value.shape)}, not {shape}")
-        if not (value.abs() < LARGEST).all():
-            raise DataError(f"{name} holds NaN, or numbers above {LARGEST:g}")
-    bounds = skill.motion_bounds
-    if bounds is not None and len(bounds.lower) != robot.n_joints:
-        raise ShapeError(f"motion_bounds are of {len(bounds.lower)} joints")
-    if not (skill.time.diff() > 0).all():
-        raise DataError("time does not increase")
+        yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
 
 
 def tried(model: Any) -> Any:
@@ -453,7 +455,7 @@ def tried(model: Any) -> Any:
     """
     try:
         skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
-        robot, times = skill.kinematics, skill.time[:: max(len(skill.time) // TRIED, 1)]
+        robot, times = skill.kinematics, skill.time[[0, len(skill.time) // 2, -1]]
         joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper)
         joints[list(robot.quaternion_starts)] = 1.0
         joints = joints.expand(len(times), -1)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tpgmm_torch.atomic import replacing
+from tpgmm_torch.atomic import open_whole, replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -232,10 +232,11 @@ def read_table(path: str | Path) -> pd.DataFrame:
     """
     path, pandas = _known(Path(path)), _pandas()
     try:
-        if path.suffix == ".csv":
-            # by default pandas is quicker, and wrong in the last digit
-            return pandas.read_csv(path, float_precision="round_trip")
-        return pandas.read_parquet(path)
+        with open_whole(path) as file:
+            if path.suffix == ".csv":
+                # by default pandas is quicker, and wrong in the last digit
+                return pandas.read_csv(file, float_precision="round_trip")
+            return pandas.read_parquet(file)
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
     except ImportError as error:

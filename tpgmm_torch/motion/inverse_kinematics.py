@@ -34,10 +34,8 @@ __all__ = ["follow_poses", "reach"]
 #: How much a posture counts beside a pose, per radian and metre. More pulls links off their
 #: poses by a millimetre, much less leaves the null space to rounding.
 POSTURE_COST = 1e-3
-#: Steps after which a pose that is not reached counts as out of reach, and their length [s].
-MOST_STEPS, STEP = 300, 0.05
-#: Outside the limits by less than this is measured so, and needs no word [rad or m].
-TOLD = 1e-4
+#: Steps after which a pose that is not reached counts as out of reach, and how many a second.
+MOST_STEPS, RATE = 300, 20.0
 
 
 def follow_poses(
@@ -93,12 +91,10 @@ def follow_poses(
     torch.Size([50, 7])
     """
     shapes = {tuple(frame.batch_shape) for frame in poses.values()}
-    if not 0 < rate < math.inf:
-        raise DataError(f"rate is a positive number of poses per second, got {rate}")
-    if [len(shape) for shape in shapes] != [1] or (0,) in shapes:
+    if list(map(len, shapes)) != [1] or (0,) in shapes:
         raise ShapeError(f"each link needs the same number of poses, got {sorted(shapes)}")
     [(length,)] = shapes
-    solver = _Solver(robot, poses, start, 1 / rate, orientations)
+    solver = _Solver(robot, poses, start, rate, orientations)
     postures = robot.joint_tensor(solver.joints if posture is None else posture)
     if postures.ndim == 1:
         postures = postures.expand(length, -1)
@@ -162,7 +158,7 @@ def reach(
     for link, frame in poses.items():
         if frame.batch_shape:
             raise ShapeError(f"{link!r} needs one pose, got {tuple(frame.batch_shape)} of them")
-    solver = _Solver(robot, poses, start, STEP, orientations)
+    solver = _Solver(robot, poses, start, RATE, orientations)
     rest = robot.joint_tensor(solver.joints if posture is None else posture)
     for _ in range(MOST_STEPS):
         missed = _missed(robot, solver.joints, poses, orientations, tolerance)
@@ -210,7 +206,7 @@ class _Solver:
         robot: Robot,
         poses: Mapping[str, Frame],
         start: Any,
-        period: float,
+        rate: float,
         orientations: bool,
     ) -> None:
         try:
@@ -222,14 +218,16 @@ class _Solver:
         for link in poses:
             if link not in robot.links:
                 raise UnknownNameError("link", link, "the robot", robot.links)
-        self.mink, self.period = mink, period
+        if not 0 < rate < math.inf:
+            raise DataError(f"rate is a positive number of poses per second, got {rate}")
+        self.mink, self.period = mink, 1 / rate
         model, self.columns = _model(robot)
         self.joints = _within_limits(robot, start, self.columns).cpu().double()
         self.configuration = mink.Configuration(model, self.joints[self.columns].numpy())
         cost = 1.0 if orientations else 0.0
         self.tasks = {n: mink.FrameTask(f"link {n}", "body", 1.0, cost) for n in poses}
         # a gain of one period: the posture is sought slowly, not within one step
-        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(period, 1.0))
+        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(self.period, 1.0))
         speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
         limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
@@ -262,8 +260,8 @@ def _within_limits(robot: Robot, start: Any, columns: list[int]) -> Tensor:
         raise ShapeError(f"one start is needed, got {tuple(joints.shape)}")
     nearest = joints.clone()
     nearest[columns] = joints.clamp(robot.lower, robot.upper)[columns]
-    moved = ((nearest - joints).abs() > TOLD).nonzero().flatten().tolist()
-    if moved:
+    # a little is measured so, and needs no word
+    if moved := (~nearest.isclose(joints, atol=1e-4)).nonzero().flatten().tolist():
         places = ", ".join(
             f"{robot.joint_names[i]!r} at {joints[i]:.4g} begins at its limit {nearest[i]:.4g}"
             for i in moved

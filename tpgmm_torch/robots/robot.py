@@ -105,8 +105,7 @@ class Robot(Described):
         Warns
         -----
         PlausibilityWarning
-            If limits of the joint vector cannot be, like ``velocity="0"``, if a joint mimics
-            what does not move, or if macros are left over: these are passed over.
+            If limits of the joints cannot be, or what else the URDF says is passed over.
 
         Examples
         --------
@@ -134,9 +133,7 @@ class Robot(Described):
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
             "dtype": str(dtype).removeprefix("torch."),
         }
-        robot = cls(model, config, device)
-        robot._tell_doubts()
-        return robot
+        return cls(model, config, device)._told()
 
     @classmethod
     def from_mjcf(
@@ -317,8 +314,8 @@ class Robot(Described):
                 self.tree, len(self.links), self.n_joints, **options
             )
 
-    def _tell_doubts(self) -> None:
-        """Warn once of all that was passed over and concerns the joint vector."""
+    def _told(self) -> Self:
+        """Itself, after one warning of all that was passed over and concerns the joints."""
         joints = (self.model.joint.get(name) for name in self.joint_names)
         said = {j.name: f"{j.name!r}: {' '.join(j.doubts)}" for j in joints if j and j.doubts}
         if found := [*said.values(), *self.model.doubts]:
@@ -333,6 +330,7 @@ class Robot(Described):
                 PlausibilityWarning,
                 stacklevel=3,
             )
+        return self
 
     def state(self, joints: Any) -> RobotState:
         """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).

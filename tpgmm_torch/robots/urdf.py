@@ -51,7 +51,7 @@ XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf
 PASSED_OVER = re.compile(
     r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|[\0-\x08\x0b\x0c\x0e-\x1f]", re.DOTALL
 )
-UNEXPANDED = re.compile(r"\$[{(]")
+UNEXPANDED = re.compile(r"\$[{(]|<xacro:")
 #: An ampersand that begins none of XML's own references.
 AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 #: What may stand before the first element of a text: a byte order mark, and space.
@@ -254,23 +254,27 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         joints = tuple(map(_joint, root.findall("joint")))
         base = _root_link(links, joints)
     except TPGMMError as error:
-        if macros or UNEXPANDED.search(text):
+        if UNEXPANDED.search(text):
             raise DataError(f"{XACRO}; {error}") from error
         raise
     doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
-    mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
-    if lost := [name for name, leader in mimicry.items() if leader and _lost(mimicry, name)]:
+    if lost := _lost_mimicry(joints):
         joints = tuple(replace(j, mimic=None) if j.name in lost else j for j in joints)
         doubts.append(f"mimicry of what does not move, or in a circle, by {', '.join(lost)}")
     return UrdfModel(root.get("name", ""), text, base, links, joints, tuple(doubts))
 
 
-def _lost(mimicry: Mapping[str, str], name: str) -> bool:
-    """Whether a joint mimics none that moves, or in the end itself."""
-    way = [mimicry[name]]
-    while way[-1] in mimicry and len(way) <= len(mimicry):
-        way.append(mimicry[way[-1]])
-    return name in way or way[0] not in mimicry
+def _lost_mimicry(joints: Iterable[UrdfJoint]) -> list[str]:
+    """Names of joints that mimic none that moves, or in the end themselves."""
+    mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
+    lost = []
+    for name, leader in mimicry.items():
+        way = [leader]
+        while way[-1] in mimicry and len(way) <= len(mimicry):
+            way.append(mimicry[way[-1]])
+        if leader and (name in way or leader not in mimicry):
+            lost.append(name)
+    return lost
 
 
 def _names(root: ElementTree.Element, tag: str) -> tuple[str, ...]:
@@ -331,28 +335,29 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
 
     Without a range ``<limit>`` gives effort and velocity alone.
     """
-    limit = element.find("limit")
-    given = {} if limit is None else limit.attrib
-
-    def number(key: str, default: float) -> float:
-        try:
-            return float(given.get(key, default))
-        except ValueError:
-            return math.nan
-
+    given: dict[str, str] = getattr(element.find("limit"), "attrib", {})
     rates = ("velocity", "acceleration", "deceleration", "jerk")
-    limits: dict[str, Any] = {key: number(key, math.inf) for key in rates}
+    limits: dict[str, Any] = {key: _number(given.get(key, math.inf)) for key in rates}
     doubts = [f'{key}="{given[key][:20]}"' for key in rates if not limits[key] > 0]
-    limits = {key: rate if rate > 0 else math.inf for key, rate in limits.items()}
-    limits["acceleration"] = min(limits["acceleration"], limits.pop("deceleration"))
-    low, high = number("lower", 0.0), number("upper", 0.0)
+    limits = {key: rate for key, rate in limits.items() if rate > 0}
+    slowing = limits.pop("deceleration", math.inf)
+    limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
+    low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
     if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
         # CAD programs write zeros where nobody has filled in anything
-        if low < high or (low == high and number("velocity", math.inf) > 0):
+        if low < high or (low == high and not doubts):
             limits |= {"lower": low, "upper": high}
         else:
             doubts.append(f'lower="{given.get("lower", 0)}" upper="{given.get("upper", 0)}"')
     return limits | {"doubts": tuple(doubts)}
+
+
+def _number(text: str | float) -> float:
+    """What an attribute says, NaN where that is no number."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _mimic(element: ElementTree.Element) -> Mimic | None:
