@@ -9,26 +9,31 @@ not fit together.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 from collections import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch import operators as builtin_operators
 from tpgmm_torch.atomic import consistent, contents, read_whole, replacing
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import ModelFileError
+from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError, TPGMMError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -39,11 +44,12 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.skills.sequence import Sequence
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save"]
+__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "tried"]
 
 #: Files of a model.
 FILES = CONFIG, TENSORS = "config.json", "model.safetensors"
@@ -61,6 +67,8 @@ KNOWN: dict[str, type] = {
 }  # fmt: skip
 #: What an estimator has learned, as :meth:`TaskParameterizedGMM.from_parameters` takes it.
 LEARNING = "n_iter_", "converged_", "lower_bound_"
+#: What fields may hold that are annotated otherwise.
+ACCEPTED: dict[Any, Any] = {float: (float, int), Any: object, Skill: object}
 LEARNED = ("weights", "means", "covariances", "time", "holds", "n_demonstrations")
 
 
@@ -148,17 +156,17 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
             f"{path} cannot be loaded onto the device {device!r}: "
             f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
         ) from error
-    return decode(config["model"], custom, on_device)
+    return tried(decode(config.get("model"), custom, on_device))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Configuration and tensors of a folder, of which nothing was cut off or changed."""
     config = _parsed(path / CONFIG, json.loads)
     if not isinstance(config, dict) or config.get("format") != FORMAT["format"]:
-        raise ModelFileError(
-            f"{path / CONFIG} describes no model; a LeRobot policy is loaded with "
-            "TPGMMPolicy.from_pretrained(path)"
-        )
+        kind = config.get("type") if isinstance(config, dict) else None
+        hint = f": it is a LeRobot policy of type {kind!r}, opened by its from_pretrained(path)"
+        hint += f"; of a TPGMMPolicy, {path / 'model'} is the model" if kind == "tpgmm" else ""
+        raise ModelFileError(f"{path / CONFIG} describes no model{hint if kind else ''}")
     if config.get("version") != FORMAT["version"]:
         raise ModelFileError(
             f"{path} has format version {config.get('version')!r}, this release reads "
@@ -176,7 +184,9 @@ def _parsed[T](file: Path, parse: Callable[[bytes], T]) -> T:
     try:
         return parse(read_whole(file))
     except (FileNotFoundError, NotADirectoryError):
-        raise ModelFileError(f"{file.parent} is not a saved model: {file} is missing") from None
+        hint = ". Give the folder, not a file in it" if file.parent.is_file() else ""
+        message = f"{file.parent} is not a saved model: {file} is missing{hint}"
+        raise ModelFileError(message) from None
     except (SafetensorError, KeyError, ValueError, OSError, RecursionError, MemoryError) as e:
         raise ModelFileError(f"{file} cannot be read: {e}") from e
 
@@ -322,19 +332,30 @@ def decode(
     ModelFileError
         If a class is not known or does not take these fields.
     """
-    try:
-        return _decoded(description, custom, tensors or {})
-    except ModelFileError:
-        raise
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ModelFileError(f"the model does not fit together: {error!r}") from error
+    return _decoded(description, "model", custom, tensors or {})
 
 
 def _decoded(
-    description: Any, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
+    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
+    """What an entry describes; whatever does not fit there is an error that names it."""
+    try:
+        return _entry(description, entry, custom, tensors)
+    except ModelFileError:
+        raise
+    except Exception as error:  # of classes and shapes that do not go together, of any kind
+        said = error if isinstance(error, TPGMMError) else repr(error)
+        raise ModelFileError(f"the entry {entry!r} does not fit together: {said}") from error
+
+
+def _entry(
+    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
+) -> Any:
+    def inner(name: object, each: Any) -> Any:
+        return _decoded(each, f"{entry}.{name}", custom, tensors)
+
     if isinstance(description, list):
-        return tuple(_decoded(each, custom, tensors) for each in description)
+        return tuple(itertools.starmap(inner, enumerate(description)))
     if not isinstance(description, Mapping):
         return description
     if "float" in description:
@@ -344,7 +365,7 @@ def _decoded(
     if "config" in description:  # of a class, which reads it itself
         return _rebuilt(dict(description), custom)
     fields = description.get("mapping", description)
-    given = {key: _decoded(each, custom, tensors) for key, each in fields.items()}
+    given = {key: inner(key, each) for key, each in fields.items()}
     return given if "mapping" in description else _rebuilt(given, custom)
 
 
@@ -364,7 +385,86 @@ def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
         return kind.from_config(given["config"])
     if (summary := given.get("summary")) is not None:
         given["summary"] = summary(given.get("robot") or given["kinematics"])
-    return REBUILT.get(kind, kind)(**given)
+    made = REBUILT.get(kind, kind)(**given)
+    if KNOWN.get(name) is kind:
+        _check_fields(made, given)
+    return made
+
+
+def _check_fields(made: Any, given: Mapping[str, Any]) -> None:
+    """Refuse fields of other types, and numbers that do not belong together, by their names."""
+    hints = get_type_hints(type(made)) if is_dataclass(made) else {}
+    for each in hints.keys() & given.keys():
+        if not _fits(value := getattr(made, each), hints[each]):
+            raise DataError(f"{each} is {str(value)[:60]!r}, not of the type {hints[each]}")
+    if isinstance(made, TaskParameterizedGMM | Regression):
+        skill = getattr(made, "skill", made)
+        for name, value, shape in _numbers(skill):
+            if value.dtype not in (torch.float32, torch.float64) or value.shape != shape:
+                raise ShapeError(f"{name}: {value.dtype} of {tuple(value.shape)}, not {shape}")
+            # their squares have to be finite in float32, too
+            if not value.float().square().isfinite().all():
+                raise DataError(f"{name} holds NaN, or numbers that are too large")
+        if not (skill.time.diff() > 0).all():
+            raise DataError("time does not increase")
+
+
+def _fits(value: Any, wanted: Any) -> bool:
+    """Whether a value is of an annotated type."""
+    origin, inner = get_origin(wanted) or wanted, get_args(wanted)
+    if origin in (Union, UnionType):
+        return any(_fits(value, each) for each in inner)
+    if origin in (tuple, abc.Sequence):
+        if not isinstance(value, tuple):
+            return False
+        any_number = origin is not tuple or inner[-1] is ...
+        members = inner[:1] * len(value) if any_number else inner
+        return len(members) == len(value) and all(map(_fits, value, members))
+    return isinstance(value, ACCEPTED.get(origin, origin))
+
+
+def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
+    """Names, values and wanted shapes of what a mixture computes with."""
+    robot, count = skill.kinematics, len(skill.log_weights)
+    yield "log_weights", skill.log_weights, (count,)
+    yield "time", skill.time, (max(len(skill.time), 2),)
+    for number, peak in enumerate(skill.peaks or ()):
+        yield f"peaks.{number}", peak, (robot.n_joints,)
+    if skill.motion_bounds is not None:
+        yield "motion_bounds", torch.zeros_like(skill.motion_bounds.lower), (robot.n_joints,)
+    for j, (one, operator) in enumerate(zip(skill.conditionals, skill.operators, strict=True)):
+        size = operator.dimension(robot)
+        shapes = (count, size), (count, size), (count, size, size), (count,), (count,)
+        for (name, value), shape in zip(vars(one).items(), shapes, strict=True):
+            yield f"{name} of operator {j}", value, shape
+        gaussians.cholesky(one.covariance, f"the covariance of operator {j}")
+        yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
+
+
+def tried(model: Any) -> Any:
+    """A model or a skill as it is, once it has been run.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM, or Skill
+
+    Raises
+    ------
+    ModelFileError
+        If it cannot be run.
+    """
+    try:
+        skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
+        robot, times = skill.kinematics, skill.time[[0, len(skill.time) // 2, -1]]
+        joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper)
+        joints[list(robot.quaternion_starts)] = 1.0
+        joints = joints.expand(len(times), -1)
+        frames = {name: Frame(torch.zeros(3).to(joints)) for name in skill.frame_names}
+        with torch.no_grad():
+            skill.start(joints, frames).estimate(times, joints, frames)
+    except Exception as error:
+        raise ModelFileError(f"{str(model)[:60]} cannot be run: {error!r}") from error
+    return model
 
 
 def _estimator(learning: Mapping[str, Any], **given: Any) -> TaskParameterizedGMM:

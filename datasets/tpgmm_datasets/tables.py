@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tpgmm_torch.atomic import replacing
+from tpgmm_torch.atomic import open_whole, replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -264,29 +264,8 @@ def read_table(path: str | Path) -> pd.DataFrame:
     """
     path, pandas = _known(Path(path)), _pandas()
     try:
-        if path.suffix == ".csv":
-            with path.open(encoding="utf-8", errors="replace") as file:
-                head, row = file.readline().strip(), file.readline()
-            marks = [mark for mark in ",;\t" if mark in head and mark in row]
-            mark = marks[0] if marks else "," if "," in head else r"\s+"
-            comma = mark != "," and re.search(r"\d,\d", row)
-            # by default pandas is quicker and wrong in the last digit, and takes the first
-            # column for names of rows where these are longer than the header
-            options: dict[str, Any] = {
-                "decimal": "," if comma else ".",
-                "float_precision": "round_trip",
-            }
-            options |= {"sep": mark, "index_col": False, "skipinitialspace": True}
-            with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
-                read = pandas.read_csv(path, **options)
-            return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
-        from pyarrow import parquet
-
-        rows, columns = parquet.read_metadata(path).num_rows, len(parquet.read_schema(path))
-        if rows * columns > MOST_NUMBERS:
-            most = f"at most {MOST_NUMBERS:g} numbers are read: write it in parts"
-            raise ValueError(f"it has {rows} rows of {columns} columns; {most}")
-        return pandas.read_parquet(path)
+        with open_whole(path) as file:
+            return _separated(file) if path.suffix == ".csv" else _parquet(file)
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
     except ImportError as error:
@@ -295,8 +274,36 @@ def read_table(path: str | Path) -> pd.DataFrame:
         ) from error
     except pandas.errors.ParserWarning as error:
         raise DataError(f"{path} has rows of more fields than its header names") from error
-    except (OSError, ValueError) as error:  # also those of the parsers
+    except (OSError, ValueError, LookupError, NotImplementedError) as error:  # also of parsers
         raise DataError(f"{path} is no table: {error}") from error
+
+
+def _separated(file: Any) -> pd.DataFrame:
+    """A .csv, whatever separates its fields."""
+    head, row = (file.readline().decode(errors="replace").strip() for _ in range(2))
+    file.seek(0)
+    marks = [mark for mark in ",;\t" if mark in head and mark in row]
+    mark = marks[0] if marks else "," if "," in head else r"\s+"
+    comma = mark != "," and re.search(r"\d,\d", row)
+    # by default pandas is quicker and wrong in the last digit, and takes the first column for
+    # names of rows where these are longer than the header
+    options = {"decimal": "," if comma else ".", "float_precision": "round_trip"}
+    options |= {"sep": mark, "index_col": False, "skipinitialspace": True}
+    pandas = _pandas()
+    with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
+        read = pandas.read_csv(file, **options)
+    return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
+
+
+def _parquet(file: Any) -> pd.DataFrame:
+    from pyarrow import parquet
+
+    whole = parquet.ParquetFile(file)
+    rows, columns = whole.metadata.num_rows, len(whole.schema_arrow)
+    if rows * columns > MOST_NUMBERS:
+        most = f"at most {MOST_NUMBERS:g} numbers are read: write it in parts"
+        raise ValueError(f"it has {rows} rows of {columns} columns; {most}")
+    return whole.read().to_pandas()
 
 
 def covariance_names(joint_names: Sequence[str]) -> list[str]:

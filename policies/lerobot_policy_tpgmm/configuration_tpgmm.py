@@ -212,6 +212,9 @@ class TPGMMConfig(StatePolicyConfig):
         for name, value in rates.items():
             if value is not None and not 0 < value < math.inf:
                 raise DataError(f"{name} is a positive number or null, got {value}")
+        for names in (self.links, self.state_names, self.action_names, self.environment_names):
+            if not all(isinstance(name, str) for name in names or ()):
+                raise DataError(f"names are texts, got {names}")
         if self.chunk_size < 1:
             raise DataError(f"chunk_size is at least 1, got {self.chunk_size}")
         if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
@@ -43,11 +42,12 @@ from tpgmm_torch.exceptions import (
     NotFittedError,
     PlausibilityWarning,
     ShapeError,
+    TPGMMError,
 )
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.persistence import decode, encode, tried
 from tpgmm_torch.robots import Kinematics, Robot
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -663,9 +663,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                     config or PreTrainedConfig.from_pretrained(folder, **options),
                 ),
             )
-        except (DecodingError, ParsingError, FileNotFoundError) as error:
+            policy = cls(config, model=model, **options).eval().to(config.device)
+            tried(policy.skill)  # with the settings of the configuration
+        except TPGMMError:
+            raise
+        except Exception as error:  # of LeRobot, its parser and torch
             raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
-        policy = cls(config, model=model, **options).eval().to(config.device)
         # LeRobot passes none of this on to a policy: who starts it must compare
         log.info(
             "observation.state is taken as %s; actions are %s, %g per second (--fps)",

@@ -99,6 +99,11 @@ def read_model(directory: Path) -> Any:
         _check_digests(directory)
         return model
     if config.exists() and (directory / SAFETENSORS_SINGLE_FILE).exists():
+        if b'"tpgmm-torch model"' in read_whole(config):
+            raise ModelFileError(
+                f"{directory} is a model, not a policy: tpgmm_torch.load(path) opens it, and "
+                "TPGMMPolicy.from_estimator(model) makes a policy of it"
+            )
         raise ModelFileError(f"{directory}: {OLD}")
     raise ModelFileError(
         f"{directory} is not a saved policy, or was saved before it was fitted: {folder} is "

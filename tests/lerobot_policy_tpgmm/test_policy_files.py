@@ -51,8 +51,10 @@ def test_the_directory_contains_a_model_in_its_own_format(saved):
     model = load(saved / "model")
     same(model, small_bottle(), 0)
     assert model.kinematics_ == small_bottle().kinematics_
-    with pytest.raises(ModelFileError, match="a LeRobot policy"):
+    with pytest.raises(ModelFileError, match=r"LeRobot policy of type 'tpgmm', .*from_pre"):
         load(saved)
+    with pytest.raises(ModelFileError, match=r"a model, not a policy: tpgmm_torch\.load"):
+        TPGMMPolicy.from_pretrained(saved / "model")
 
 
 def test_a_policy_comes_back_equal(saved):

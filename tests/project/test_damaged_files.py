@@ -11,28 +11,45 @@ import torch
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support import lerobot_sets, skills
-from tests.support.damage import TABLES, WITH_JSON, blocks, bounded, damaged, one
-from tests.support.policies import fitted
+from tests.support.damage import (
+    SIGNED,
+    TABLES,
+    TEXTS,
+    WITH_JSON,
+    blocks,
+    bounded,
+    damaged,
+    one,
+)
+from tests.support.policies import ENVIRONMENT, STATE, act, batch, fitted
 from tests.support.skills import hands
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_datasets.situation_files import read_situations
-from tpgmm_torch import Demonstration, Robot, save
-from tpgmm_torch import load as load_model
+from tpgmm_datasets.tables import (
+    demonstrations_from_frame,
+    demonstrations_to_frame,
+    read_table,
+    write_table,
+)
+from tpgmm_torch import Demonstration, Robot, Situation, load, save
+from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import TPGMMError
+from tpgmm_torch.skills.via_points import ViaPoints
 
 DEMONSTRATIONS = 50
 
 
-def check_all(original, tmp_path, damages, seeds, load, check):
+def check_all(original, tmp_path, damages, seeds, read, check):
     """Load damaged copies; how many were refused."""
     outcome = Counter()
     for seed in seeds:
         with damaged(original, tmp_path, damages, seed) as (path, what):
             try:
                 with bounded(what):
-                    found = load(path)
+                    found = read(path)
             except TPGMMError as error:
                 assert re.search(r"\w", str(error)), what
                 outcome["refused"] += 1
@@ -71,7 +88,36 @@ def same_model(found):
 
 @pytest.mark.parametrize("seeds", blocks(200, 5000), ids=str)
 def test_models(model, tmp_path, seeds):
-    check_all(model, tmp_path, WITH_JSON, seeds, load_model, same_model)
+    check_all(model, tmp_path, WITH_JSON, seeds, load, same_model)
+
+
+def middle(skill):
+    """A posture within the limits, and objects."""
+    robot = skill.kinematics
+    joints = torch.zeros_like(robot.lower).clamp(robot.lower, robot.upper) + 0.1
+    joints[[place + k for place in robot.quaternion_starts for k in range(4)]] = 0.5
+    return joints, {name: Frame([0.3, 0.0, 0.1]) for name in skill.frame_names}
+
+
+def runs(found):
+    """Whether what was loaded can be run: a reproduction, and ticks of a controller."""
+    skill = getattr(found, "skill", found)
+    joints, frames = middle(skill)
+    [whole] = rollout(skill, [Situation(joints, frames)], bounds="robot", blend=1.0)
+    controller = Controller(skill, joints, frames)
+    for _ in range(4):
+        controller.step(0.02, controller.reference)
+    return bool(whole.joints.isfinite().all()) and bool(controller.reference.isfinite().all())
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("seeds", blocks(150, 5000), ids=str)
+@pytest.mark.parametrize("kind", ["model", "skill"])
+def test_models_with_other_settings(kind, model, tmp_path, seeds):
+    through = ViaPoints(hands().skill, ["1.0:position:left@cup=0.1,0.1,0.2"], 0.5)
+    if kind == "skill":
+        save(through, model := tmp_path / "skill")
+    check_all(model, tmp_path, SIGNED, seeds, load, runs)
 
 
 # Policies
@@ -93,8 +139,25 @@ def same_policy(found):
 
 @pytest.mark.parametrize("seeds", blocks(20, 500), ids=str)
 def test_policies(policy, tmp_path, seeds):
-    load = TPGMMPolicy.from_pretrained
-    check_all(policy, tmp_path, WITH_JSON, seeds, load, same_policy)
+    check_all(policy, tmp_path, WITH_JSON, seeds, TPGMMPolicy.from_pretrained, same_policy)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("seeds", blocks(40, 5000), ids=str)
+def test_policies_with_other_settings(policy, tmp_path, seeds):
+    observed = {key: value[:1] for key, value in batch().items()}
+    shown = dict(zip(fitted().joints.state_names, observed[STATE][0].tolist(), strict=True))
+
+    def acts(found):
+        found.config.control.largest_start_gap = None  # in other units it stands elsewhere
+        state = [shown.get(name, 0.0) for name in found.joints.state_names]
+        pose = torch.nn.functional.pad(
+            observed[ENVIRONMENT], (0, found.config.env_state_feature.shape[0] - 7)
+        )
+        given = {STATE: torch.tensor([state]), ENVIRONMENT: pose}
+        return bool(act(found, given, 3).isfinite().all())
+
+    check_all(policy, tmp_path, SIGNED, seeds, TPGMMPolicy.from_pretrained, acts)
 
 
 # Data sets
@@ -168,20 +231,30 @@ def test_data_sets_with_check_sums(written, tmp_path, seeds):
 
 @pytest.mark.parametrize("seeds", blocks(40, 2000), ids=str)
 def test_data_sets_without_check_sums(foreign, tmp_path, seeds):
-    def consistent(found):
-        """Finite, of one robot, and on one time: more cannot be known."""
-        return (
-            all(
-                len(d.joints) == len(d.time)
-                and d.joint_names == found[0].joint_names
-                and all(bool(part.isfinite().all()) for part in parts(d))
-                and bool((d.time.diff() > 0).all())
-                for d in found
-            )
-            and len(found) > 0
-        )
+    check_all(foreign, tmp_path, TABLES, seeds, load_lerobot, finite)
 
-    check_all(foreign, tmp_path, TABLES, seeds, load_lerobot, consistent)
+
+def finite(found):
+    """Finite, of one robot, and on one time: more cannot be known."""
+    return len(found) > 0 and all(
+        len(d.joints) == len(d.time)
+        and d.joint_names == found[0].joint_names
+        and all(bool(part.isfinite().all()) for part in parts(d))
+        and bool((d.time.diff() > 0).all())
+        for d in found
+    )
+
+
+@pytest.mark.parametrize("seeds", blocks(100, 2000), ids=str)
+def test_tables(tmp_path, seeds):
+    original = tmp_path / "original"
+    original.mkdir()
+    write_table(demonstrations_to_frame(list(recorded())), original / "shown.csv")
+
+    def read(path):
+        return demonstrations_from_frame(read_table(path / "shown.csv"))
+
+    check_all(original, tmp_path, TEXTS, seeds, read, finite)
 
 
 # Situations
@@ -198,14 +271,14 @@ def test_situations(tmp_path):
     original.mkdir()
     (original / "situations.json").write_text(json.dumps(given))
 
-    def load(path):
+    def read(path):
         return read_situations(path / "situations.json", ["shoulder", "elbow"])
 
-    def finite(found):
+    def whole(found):
         return all(bool(one.joints.isfinite().all()) and len(one.joints) == 2 for one in found)
 
     for seeds in blocks(100, 2000):
-        check_all(original, tmp_path, WITH_JSON, seeds, load, finite)
+        check_all(original, tmp_path, WITH_JSON, seeds, read, whole)
 
 
 # URDFs

@@ -1,8 +1,10 @@
 """Files as they come from failing disks, broken copies and hands: changed, cut, exchanged.
 
-``TPGMM_FUZZ=full`` (``make fuzz``) asks for thousands of them in place of a few.
+``TPGMM_FUZZ=full`` (``make fuzz``) asks for thousands of them in place of a few, from the seed
+``TPGMM_FUZZ_FIRST`` on.
 """
 
+import hashlib
 import json
 import os
 import resource
@@ -10,14 +12,22 @@ import shutil
 import signal
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
+from safetensors.torch import load, save
+
+from lerobot_policy_tpgmm import policy_files
+from tpgmm_torch import persistence
+from tpgmm_torch.exceptions import ModelFileError
 
 FULL = os.environ.get("TPGMM_FUZZ") == "full"
+#: The first seed of a full run.
+FIRST = int(os.environ.get("TPGMM_FUZZ_FIRST", "0"))
 #: Files in one test, of which a full run has many.
 BLOCK = 500
 #: No file takes longer [s], and all together no more memory [bytes].
@@ -38,7 +48,8 @@ def blocks(small: int, full: int) -> list[range]:
     """Seeds of the damaged files, a range for each test."""
     if not FULL:
         return [range(small)]
-    return [range(start, min(start + BLOCK, full)) for start in range(0, full, BLOCK)]
+    starts = range(FIRST, FIRST + full, BLOCK)
+    return [range(start, min(start + BLOCK, FIRST + full)) for start in starts]
 
 
 class Hang(BaseException):
@@ -58,6 +69,7 @@ def bounded(what: str) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
+            warnings.simplefilter("ignore", UserWarning)
             yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
@@ -127,20 +139,97 @@ def exchange_files(root: Path, rng: np.random.Generator) -> str:
 
 
 def edit_json(root: Path, rng: np.random.Generator) -> str:
+    """An entry is another value or gone, has another name or place, is shorter or longer."""
     path = one(files(root, ".json"), rng)
-    content = json.loads(path.read_text())
-    holder, key = [content], 0
-    while isinstance(holder[key], dict | list) and holder[key] and rng.random() < 0.9:
-        holder = holder[key]
-        key = one(list(holder) if isinstance(holder, dict) else list(range(len(holder))), rng)
-    if holder[key] is content:
-        content = one(VALUES, rng)
-    elif rng.random() < 0.2:
+    content = [json.loads(path.read_text())]
+    # settings, and by chance what is deep in them
+    places = list(_entries(content))
+    holder, key = one(places[: len(places) if rng.random() < 0.5 else 40], rng)
+    kind = one(["value", "value", "gone", "name", "place", "text", "longer"], rng)
+    other, there = one(places, rng)
+    if kind == "name" and isinstance(holder, dict):
+        holder[str(there)] = holder.pop(key)
+    elif kind == "gone" and holder is not content:
         del holder[key]
+    elif kind == "place" and isinstance(holder[key], str | int | float | None):
+        holder[key] = other[there]
+    elif kind == "text":
+        holder[key] = str(holder[key])
+    elif kind == "longer" and isinstance(holder[key], list):
+        holder[key] = holder[key][1:] if rng.random() < 0.5 else 2 * holder[key]
     else:
         holder[key] = one(VALUES, rng)
-    path.write_text(json.dumps(content))
-    return f"{key} edited in {path.name}"
+    path.write_text(json.dumps(content[0]))
+    return f"{key} edited in {path.name}: {kind}"
+
+
+def _entries(holder: list | dict) -> Iterator[tuple[list | dict, int | str]]:
+    for key in list(holder) if isinstance(holder, dict) else range(len(holder)):
+        yield holder, key
+        if isinstance(holder[key], dict | list):
+            yield from _entries(holder[key])
+
+
+def change_tensor(root: Path, rng: np.random.Generator) -> str:
+    """A tensor of a model is another one, of another shape or dtype, or holds no numbers."""
+    path = one(files(root, ".safetensors"), rng)
+    tensors = load(path.read_bytes())
+    name, other = one(sorted(tensors), rng), one(sorted(tensors), rng)
+    changed, numbers = tensors[name], tensors[name].flatten().clone()
+    numbers[int(rng.integers(len(numbers)))] = one(
+        [np.nan, np.inf, -1.0, 0.0, 1e30, 1e-30], rng
+    )
+    kinds = {
+        "numbers": numbers.view(changed.shape),
+        "dtype": changed.to(one([torch.float16, torch.float32, torch.int64, torch.bool], rng)),
+        "shape": one([changed[None], changed[1:], changed[:0], changed.flatten()], rng),
+        "huge": torch.zeros(100_000, dtype=changed.dtype),
+        "place": tensors[other],
+    }
+    kind = one([*kinds, "numbers", "gone"], rng)
+    tensors |= {name: kinds.get(kind, changed).clone()}
+    if kind == "gone":
+        del tensors[name]
+    path.write_bytes(save({key: each.contiguous() for key, each in tensors.items()}))
+    return f"tensor {name}: {kind}"
+
+
+def signed_again(damage: Damage) -> Damage:
+    """The damage as of somebody who knows the digests of models and policies."""
+
+    def done(root: Path, rng: np.random.Generator) -> str:
+        what = damage(root, rng)
+        for file in root.rglob("config.json"):
+            config = json.loads(file.read_text())
+            if isinstance(config, dict) and "digest" in config:
+                blob = (file.parent / persistence.TENSORS).read_bytes()
+                config["tensors_sha256"] = hashlib.sha256(blob).hexdigest()
+                config["digest"] = persistence._digest(config)
+                file.write_text(json.dumps(config))
+        with suppress(ModelFileError):  # of files that no digest is made of
+            if (root / policy_files.DIGESTS).exists():
+                digests = {n: policy_files._digest(root / n) for n in policy_files.COMPARED}
+                (root / policy_files.DIGESTS).write_text(json.dumps(digests))
+        return what
+
+    return done
+
+
+def change_text(root: Path, rng: np.random.Generator) -> str:
+    """A cell of a table is another word, a line is doubled or gone, separators are others."""
+    path = one(files(root, ".csv"), rng)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    row = int(rng.integers(len(lines))) if rng.random() < 0.7 else 0
+    column, kind = int(rng.integers(len(lines[0]))), one(["cell", "cell", "line", "again"], rng)
+    if kind == "cell":
+        lines[row][column] = str(one([*VALUES, '"', "1,5", "2024-01-01", "", *lines[0]], rng))
+    elif kind == "line":
+        del lines[row]
+    else:
+        lines.insert(row, lines[row])
+    separator = one([",", ",", ",", ";", "\t", ", "], rng)
+    path.write_text("\n".join(map(separator.join, lines)))
+    return f"{kind} {column} of line {row}"
 
 
 def flip_footer(root: Path, rng: np.random.Generator) -> str:
@@ -197,6 +286,8 @@ FILES: tuple[Damage, ...] = (
 )  # fmt: skip
 WITH_JSON = (*FILES, edit_json, edit_json)
 TABLES = (*WITH_JSON, flip_footer, change_table, change_table)
+TEXTS = (*FILES, *[change_text] * 6)
+SIGNED = tuple(map(signed_again, (edit_json, edit_json, change_tensor)))
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -41,13 +42,18 @@ def geometric_mean(a: Tensor, b: Tensor) -> Tensor:
     b : Tensor of shape (..., n, n)
         Symmetric positive semi-definite.
 
+    Raises
+    ------
+    DataError
+        If the first is not positive definite.
+
     Examples
     --------
     >>> a, b = torch.tensor([1.0, 4.0]).diag(), torch.tensor([4.0, 9.0]).diag()
     >>> [round(float(mean), 3) for mean in geometric_mean(a, b).diagonal()]
     [2.0, 6.0]
     """
-    factor = torch.linalg.cholesky(a)
+    factor = gaussians.cholesky(a, "the first matrix of the mean (the inertia)")
     left = torch.linalg.solve_triangular(factor, b, upper=False)
     inner = torch.linalg.solve_triangular(factor, left.mT, upper=False)
     values, vectors = torch.linalg.eigh(inner)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,8 @@ __all__ = ["follow_poses", "reach"]
 #: How much a posture counts beside a pose, per radian and metre. More pulls links off their
 #: poses by a millimetre, much less leaves the null space to rounding.
 POSTURE_COST = 1e-3
-#: Steps after which a pose that is not reached counts as out of reach, and their length [s].
-MOST_STEPS, STEP = 300, 0.05
+#: Steps after which a pose that is not reached counts as out of reach, and how many a second.
+MOST_STEPS, RATE = 300, 20.0
 
 
 def follow_poses(
@@ -55,6 +56,7 @@ def follow_poses(
     poses : mapping of str to Frame
         By link, T poses each in the robot's base frame. The first are those at the start.
     start : array-like of shape (n_joints,)
+        Outside the limits of position, the nearest posture within is the first.
     rate : float
         Poses per second; joints keep within their limits of position and speed.
     posture : array-like of shape (n_joints,) or (T, n_joints), optional
@@ -68,8 +70,14 @@ def follow_poses(
     Raises
     ------
     DependencyError, UnknownNameError, DataError, ShapeError
-        Without mink (of the extra ``ik``) or such a link, for joints that follow others, or if
-        poses and postures are not T each.
+        Without mink (of the extra ``ik``) or such a link, for joints that follow others, if
+        the rate is not positive, the poses are too far to compute with, or poses and postures
+        are not T each.
+
+    Warns
+    -----
+    PlausibilityWarning
+        If poses are missed, or the start is outside the limits.
 
     Examples
     --------
@@ -83,11 +91,11 @@ def follow_poses(
     torch.Size([50, 7])
     """
     shapes = {tuple(frame.batch_shape) for frame in poses.values()}
-    if [len(shape) for shape in shapes] != [1]:
+    if list(map(len, shapes)) != [1] or (0,) in shapes:
         raise ShapeError(f"each link needs the same number of poses, got {sorted(shapes)}")
     [(length,)] = shapes
-    solver = _Solver(robot, poses, start, 1 / rate, orientations)
-    postures = robot.joint_tensor(start if posture is None else posture)
+    solver = _Solver(robot, poses, start, rate, orientations)
+    postures = robot.joint_tensor(solver.joints if posture is None else posture)
     if postures.ndim == 1:
         postures = postures.expand(length, -1)
     else:
@@ -98,7 +106,7 @@ def follow_poses(
     for step in range(1, length):
         wanted = {link: frame[step] for link, frame in poses.items()}
         joints.append(solver.step(wanted, postures[step]))
-    found = torch.stack(joints)
+    found = robot.joint_tensor(torch.stack(joints))
     if missed := _missed(robot, found, poses, orientations, tolerance):
         warnings.warn(
             f"the poses are missed: {missed}. They are out of reach, faster than the joints "
@@ -126,7 +134,8 @@ def reach(
     poses : mapping of str to Frame
         By link, one pose each in the robot's base frame.
     start : array-like of shape (n_joints,)
-        Where the search begins; it ends in a posture near it.
+        Where the search begins, or outside the limits of position at the nearest posture
+        within; it ends in a posture near it.
     posture : array-like of shape (n_joints,), optional
         Posture that joints seek where poses leave them free; by default the start.
     orientations : bool, default=True
@@ -140,16 +149,21 @@ def reach(
         As for :func:`follow_poses`.
     DataError
         If a pose is out of reach from there, or as for :func:`follow_poses`.
+
+    Warns
+    -----
+    PlausibilityWarning
+        If the start is outside the limits.
     """
     for link, frame in poses.items():
         if frame.batch_shape:
             raise ShapeError(f"{link!r} needs one pose, got {tuple(frame.batch_shape)} of them")
-    rest = robot.joint_tensor(start if posture is None else posture)
-    solver = _Solver(robot, poses, start, STEP, orientations)
+    solver = _Solver(robot, poses, start, RATE, orientations)
+    rest = robot.joint_tensor(solver.joints if posture is None else posture)
     for _ in range(MOST_STEPS):
         missed = _missed(robot, solver.joints, poses, orientations, tolerance)
         if not missed:
-            return solver.joints
+            return robot.joint_tensor(solver.joints)
         solver.step(poses, rest)
     raise DataError(
         f"the poses are not reached from this start: {missed}. Start nearer, ask for positions "
@@ -165,6 +179,7 @@ def _missed(
     tolerance: float,
 ) -> str:
     """Largest distance of links from their poses, of those farther than a tolerance."""
+    joints = robot.joint_tensor(joints)
     state, texts = robot.state(joints), []
     for link, pose in poses.items():
         away = (pose.position.to(joints) - state.position(link)).norm(dim=-1)
@@ -191,7 +206,7 @@ class _Solver:
         robot: Robot,
         poses: Mapping[str, Frame],
         start: Any,
-        period: float,
+        rate: float,
         orientations: bool,
     ) -> None:
         try:
@@ -203,16 +218,16 @@ class _Solver:
         for link in poses:
             if link not in robot.links:
                 raise UnknownNameError("link", link, "the robot", robot.links)
-        self.mink, self.period = mink, period
+        if not 0 < rate < math.inf:
+            raise DataError(f"rate is a positive number of poses per second, got {rate}")
+        self.mink, self.period = mink, 1 / rate
         model, self.columns = _model(robot)
-        self.joints = robot.joint_tensor(start).cpu().double()
-        if self.joints.ndim != 1:
-            raise ShapeError(f"one start is needed, got {tuple(self.joints.shape)}")
+        self.joints = _within_limits(robot, start, self.columns).cpu().double()
         self.configuration = mink.Configuration(model, self.joints[self.columns].numpy())
         cost = 1.0 if orientations else 0.0
-        self.tasks = {link: mink.FrameTask(link, "body", 1.0, cost) for link in poses}
+        self.tasks = {n: mink.FrameTask(f"link {n}", "body", 1.0, cost) for n in poses}
         # a gain of one period: the posture is sought slowly, not within one step
-        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(period, 1.0))
+        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(self.period, 1.0))
         speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
         limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
@@ -225,13 +240,38 @@ class _Solver:
             target = self.mink.SE3(np.concatenate((orientation, position)))
             self.tasks[link].set_target(target)
         tasks = [*self.tasks.values(), self.posture]
-        velocity = self.mink.solve_ik(
-            self.configuration, tasks, self.period, "daqp", damping=1e-9, limits=self.limits
+        options: dict[str, Any] = {"damping": 1e-9, "limits": self.limits}
+        arguments = self.configuration, tasks, self.period, "daqp"
+        with np.errstate(over="ignore", invalid="ignore"), suppress(self.mink.MinkError):
+            velocity = self.mink.solve_ik(*arguments, **options)
+            self.configuration.integrate_inplace(velocity, self.period)
+            found = torch.from_numpy(self.configuration.q.copy())
+            if found.isfinite().all():
+                self.joints = self.joints.index_copy(0, torch.tensor(self.columns), found)
+                return self.joints
+        places = {link: pose.position.tolist() for link, pose in poses.items()}
+        raise DataError(f"no step leads towards {places}: ask for poses within reach")
+
+
+def _within_limits(robot: Robot, start: Any, columns: list[int]) -> Tensor:
+    """The start, where some joints begin at a limit if they are beyond it."""
+    joints = robot.joint_tensor(start)
+    if joints.ndim != 1:
+        raise ShapeError(f"one start is needed, got {tuple(joints.shape)}")
+    nearest = joints.clone()
+    nearest[columns] = joints.clamp(robot.lower, robot.upper)[columns]
+    # a little is measured so, and needs no word
+    if moved := (~nearest.isclose(joints, atol=1e-4)).nonzero().flatten().tolist():
+        places = ", ".join(
+            f"{robot.joint_names[i]!r} at {joints[i]:.4g} begins at its limit {nearest[i]:.4g}"
+            for i in moved
         )
-        self.configuration.integrate_inplace(velocity, self.period)
-        self.joints = self.joints.clone()
-        self.joints[self.columns] = torch.from_numpy(self.configuration.q.copy())
-        return self.joints
+        warnings.warn(
+            f"the start is outside the robot's limits: {places}",
+            PlausibilityWarning,
+            stacklevel=4,
+        )
+    return nearest
 
 
 def _model(robot: Robot) -> tuple[Any, list[int]]:
@@ -239,13 +279,12 @@ def _model(robot: Robot) -> tuple[Any, list[int]]:
     import mujoco
 
     spec = mujoco.MjSpec()
-    spec.compiler.degree = False
     bodies = [spec.worldbody]
     columns: list[int] = []
     links = iter(robot.links)
     for one in robot.tree[1:]:
         if one.joint is None:
-            bodies.append(_add(bodies[one.parent], next(links), one.pose))
+            bodies.append(_add(bodies[one.parent], f"link {next(links)}", one.pose))
             continue
         name = robot.joint_names[one.joint]
         if one.joint in columns or (one.multiplier, one.shift) != (1.0, 0.0):
@@ -256,16 +295,16 @@ def _model(robot: Robot) -> tuple[Any, list[int]]:
         columns.append(one.joint)
         slide = mujoco.mjtJoint.mjJNT_SLIDE if one.slides else mujoco.mjtJoint.mjJNT_HINGE
         body = _add(bodies[one.parent], f"frame {len(columns)}", one.pose)
-        ends = [float(limit[one.joint]) for limit in (robot.lower, robot.upper)]
-        bounded = all(map(math.isfinite, ends))
-        joint = body.add_joint(name=name, type=slide, axis=(0.0, 0.0, 1.0))
-        joint.limited = int(bounded)
-        if bounded:
-            joint.range = ends
+        body.add_joint(name=name, type=slide, axis=(0.0, 0.0, 1.0))
         bodies.append(body)
     model = spec.compile()
     names = [model.joint(i).name for i in range(model.njnt)]
-    return model, [robot.joint_names.index(name) for name in names]
+    columns = [robot.joint_names.index(name) for name in names]
+    ranges = torch.stack((robot.lower, robot.upper), -1)[columns].cpu().double()
+    # only now, as the compiler takes no range of one point
+    model.jnt_limited[:] = ranges.isfinite().all(-1).numpy()
+    model.jnt_range[:] = ranges.nan_to_num(0.0, 0.0, 0.0).numpy()
+    return model, columns
 
 
 def _add(parent: Any, name: str, pose: Array) -> Any:

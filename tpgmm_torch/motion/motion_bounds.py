@@ -139,7 +139,8 @@ class MotionBounds:
         -----
         MissingLimitsWarning
             If the description of the robot lacks limits of position or speed that are not
-            given either; not where it has none of speed at all, as an MJCF.
+            given either; not where it has none of speed at all, as an MJCF, nor of joints of
+            which a warning told when the robot was made.
         """
         if not isinstance(kinematics, Kinematics):  # a skill
             demonstrated = demonstrated or kinematics.peaks
@@ -185,7 +186,7 @@ def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None
     missing = [
         name
         for name, there in zip(kinematics.joint_names, known, strict=True)
-        if name in kinematics.without_limits and not there
+        if name in set(kinematics.without_limits).difference(kinematics.doubtful) and not there
     ]
     if missing:
         warnings.warn(

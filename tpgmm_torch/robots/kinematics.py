@@ -254,6 +254,8 @@ class Kinematics(abc.ABC):
         More limits of the same kind.
     without_limits : tuple of str, default=()
         Joints of which limits should be known and are not.
+    doubtful : tuple of str, default=()
+        Those of them of which a warning told when the robot was made.
     quaternion_starts : tuple of int, default=()
         Where unit quaternions start in the joint vector; robots have none.
     lengths : tuple of int, default=()
@@ -286,6 +288,7 @@ class Kinematics(abc.ABC):
     acceleration: Tensor | None = None
     jerk: Tensor | None = None
     without_limits: tuple[str, ...] = ()
+    doubtful: tuple[str, ...] = ()
     quaternion_starts: tuple[int, ...] = ()
     lengths: tuple[int, ...] = ()
     angles: tuple[int, ...] = ()

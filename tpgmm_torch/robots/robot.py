@@ -102,6 +102,11 @@ class Robot(Described):
         UnknownNameError
             If a link or a joint is not in the URDF.
 
+        Warns
+        -----
+        PlausibilityWarning
+            If limits of the joints cannot be, or what else the URDF says is passed over.
+
         Examples
         --------
         >>> urdf = '''<robot name="lift"><link name="base"/><link name="hand"/>
@@ -126,7 +131,7 @@ class Robot(Described):
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
             "dtype": str(dtype).removeprefix("torch."),
         }
-        return cls(model, config, device)
+        return cls(model, config, device)._told()
 
     @classmethod
     def from_mjcf(
@@ -275,7 +280,9 @@ class Robot(Described):
         options: dict[str, Any] = _side_by_side(robots)
         first = next(iter(robots.values())).lower
         options |= {"base": base, "dtype": first.dtype, "device": first.device}
-        return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
+        with warnings.catch_warnings():  # each has told its own doubts
+            warnings.simplefilter("ignore", PlausibilityWarning)
+            return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -312,6 +319,24 @@ class Robot(Described):
                 self.tree, len(self.links), self.n_joints, **options
             )
 
+    def _told(self) -> Self:
+        """Itself, after one warning of all that was passed over and concerns the joints."""
+        joints = (self.model.joint.get(name) for name in self.joint_names)
+        said = {j.name: f"{j.name!r}: {' '.join(j.doubts)}" for j in joints if j and j.doubts}
+        if found := [*said.values(), *self.model.doubts]:
+            bounds = {"velocity": dict.fromkeys(said, 1.0)}
+            remedy = (
+                f", or give bounds where it moves: Controller(..., {bounds=}), in a policy "
+            )
+            remedy += "--policy.control.velocity"
+            warnings.warn(
+                f"the URDF of {self.model.name!r} says what cannot be, and it is passed over: "
+                f"{'; '.join(found)}. Correct the URDF{remedy if said else ''}",
+                PlausibilityWarning,
+                stacklevel=3,
+            )
+        return self
+
     def state(self, joints: Any) -> RobotState:
         """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
 
@@ -341,7 +366,7 @@ class Robot(Described):
         device = self.lower.device if device is None else torch.device(device)
         if name == self._config["dtype"] and device == self.lower.device:
             return self
-        return self.from_config({**self._config, "dtype": name}, device)
+        return type(self)(self.model, {**self._config, "dtype": name}, device)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
@@ -393,7 +418,7 @@ class Robot(Described):
     def _root(self) -> Frame:
         """Where the root of the description is in the frame of the base, which it must hold."""
         config = self._config | {"links": [self.model.root], "dtype": "float64"}
-        state = self.from_config(config).state(torch.zeros(self.n_joints))
+        state = type(self)(self.model, config, "cpu").state(torch.zeros(self.n_joints))
         if state.jacobians.any():
             raise DataError(
                 f"the base {config['base']!r} of a robot is moved by its joints: give it one "
@@ -628,12 +653,6 @@ def _limit_leader(
     row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
     ends = sorted((end - leader.offset) / factor for end in (joint.lower, joint.upper))
     low, high = max(row[0], ends[0]), min(row[1], ends[1])
-    if low > high + 1e-9:
-        raise DataError(
-            f"the limits of joint {joint.name!r}, {joint.lower:g} to {joint.upper:g}, "
-            f"leave no room to {leader.joint!r}, which it mimics as {factor:g} * "
-            f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
-        )
     if high - low < 1e-9 < row[1] - row[0]:
         return False
     row[:2] = low, high

@@ -22,7 +22,7 @@ import numpy as np
 
 from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
 __all__ = [
     "Mimic",
@@ -46,6 +46,14 @@ __all__ = [
 SINGLE = dict.fromkeys(("revolute", "continuous", "prismatic"), 1)
 FREEDOMS = {"fixed": 0, **SINGLE, "planar": 3, "floating": 6}
 XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
+#: What readers of URDF pass over, and expat does not: comments with ``--`` in them,
+#: instructions and declarations anywhere, control characters. What has no end is the rest.
+PASSED_OVER = re.compile(
+    r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|[\0-\x08\x0b\x0c\x0e-\x1f]", re.DOTALL
+)
+UNEXPANDED = re.compile(r"\$[{(]|<xacro:")
+#: An ampersand that begins none of XML's own references.
+AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 #: What may stand before the first element of a text: a byte order mark, and space.
 BEFORE_XML = "\ufeff \t\r\n"
 #: The axis of a joint that names none.
@@ -78,6 +86,8 @@ class UrdfJoint:
         the deceleration is one of the acceleration too.
     mimic : Mimic or None
         What it follows.
+    doubts : tuple of str
+        Limits that cannot be, as they are written; they count as none.
     """
 
     name: str
@@ -92,6 +102,7 @@ class UrdfJoint:
     acceleration: float = math.inf
     jerk: float = math.inf
     mimic: Mimic | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def movable(self) -> bool:
@@ -115,6 +126,8 @@ class UrdfModel:
         All links, in document order.
     joints : tuple of UrdfJoint
         All joints, in document order.
+    doubts : tuple of str
+        What was passed over, as it cannot be meant: macros left over, mimicry of nothing.
     """
 
     name: str
@@ -122,6 +135,7 @@ class UrdfModel:
     root: str
     links: tuple[str, ...]
     joints: tuple[UrdfJoint, ...]
+    doubts: tuple[str, ...] = ()
 
     @cached_property
     def joint(self) -> dict[str, UrdfJoint]:
@@ -145,26 +159,13 @@ class UrdfModel:
         ----------
         name : str
             A movable joint; one that mimics no other leads itself.
-
-        Raises
-        ------
-        UnknownNameError
-            If it mimics a joint that is not movable or not there.
-        DataError
-            If joints mimic one another in a circle.
         """
-        multiplier, offset, at = 1.0, 0.0, name
-        for _ in self.movable:
-            mimic = self.joint[at].mimic
-            if mimic is None:
-                return Mimic(at, multiplier, offset)
-            if mimic.joint not in self.movable:
-                where = f"the movable joints of the URDF (joint {at!r} mimics it)"
-                raise UnknownNameError("joint", mimic.joint, where, self.movable)
+        multiplier, offset = 1.0, 0.0
+        while (mimic := self.joint[name].mimic) is not None:
             offset += multiplier * mimic.offset
             multiplier *= mimic.multiplier
-            at = mimic.joint
-        raise DataError(f"joint {name!r} follows joints that mimic one another in a circle")
+            name = mimic.joint
+        return Mimic(name, multiplier, offset)
 
 
 def is_text(source: str | bytes | os.PathLike[str]) -> bool:
@@ -173,7 +174,7 @@ def is_text(source: str | bytes | os.PathLike[str]) -> bool:
 
 
 def description_text(source: str | bytes | os.PathLike[str]) -> str:
-    """The text of a robot's description.
+    """The text of a robot's description, in UTF-8 or else Latin-1.
 
     Parameters
     ----------
@@ -183,14 +184,16 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
     Raises
     ------
     DataError
-        If the file cannot be read, or is not UTF-8.
+        If the file cannot be read, or is no text in one of these.
     """
     if is_text(source):
         return str(source).lstrip(BEFORE_XML)
     try:
         content = source if isinstance(source, bytes) else read_whole(Path(source))
-        return content.decode("utf-8-sig").lstrip()
+        return content.decode("utf-8-sig").lstrip(BEFORE_XML)
     except UnicodeDecodeError as error:
+        if is_text(text := content.removeprefix(b"\xef\xbb\xbf").decode("latin-1")):
+            return text.lstrip(BEFORE_XML)
         raise DataError(
             f"the robot's description is not UTF-8 text, convert it: {error}"
         ) from error
@@ -199,7 +202,7 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """The outermost element of a description; prefixes and namespaces mean nothing.
+    """The outermost element of a description; prefixes, namespaces and comments mean nothing.
 
     Parameters
     ----------
@@ -221,11 +224,10 @@ def parse_xml(text: str) -> ElementTree.Element:
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.StartDoctypeDeclHandler = refuse
     try:
-        parser.Parse(text, True)
+        parser.Parse(AMPERSAND.sub("&amp;", PASSED_OVER.sub("", text)).lstrip(), True)
         return builder.close()
-    except (expat.ExpatError, ValueError) as error:
-        reason = f"the description is not well-formed XML: {error}"
-        raise DataError(XACRO if "<xacro:" in text else reason) from error
+    except (expat.ExpatError, UnicodeError) as error:
+        raise DataError(f"the description is not well-formed XML: {error}") from error
 
 
 def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
@@ -246,11 +248,33 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     if root.tag != "robot":
         hint = ": that is an MJCF, Robot.from_mjcf reads it" if root.tag == "mujoco" else ""
         raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{hint}")
-    if any(element.tag.startswith("xacro:") for element in root.iter()):
-        raise DataError(XACRO)
-    links, _ = _names(root, "link"), _names(root, "joint")
-    joints = tuple(map(_joint, root.findall("joint")))
-    return UrdfModel(root.get("name", ""), text, _root_link(links, joints), links, joints)
+    macros = sorted({each.tag for each in root.iter() if each.tag.startswith("xacro:")})
+    try:
+        links, _ = _names(root, "link"), _names(root, "joint")
+        joints = tuple(map(_joint, root.findall("joint")))
+        base = _root_link(links, joints)
+    except TPGMMError as error:
+        if UNEXPANDED.search(text):
+            raise DataError(f"{XACRO}; {error}") from error
+        raise
+    doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
+    if lost := _lost_mimicry(joints):
+        joints = tuple(replace(j, mimic=None) if j.name in lost else j for j in joints)
+        doubts.append(f"mimicry of what does not move, or in a circle, by {', '.join(lost)}")
+    return UrdfModel(root.get("name", ""), text, base, links, joints, tuple(doubts))
+
+
+def _lost_mimicry(joints: Iterable[UrdfJoint]) -> list[str]:
+    """Names of joints that mimic none that moves, or in the end themselves."""
+    mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
+    lost = []
+    for name, leader in mimicry.items():
+        way = [leader]
+        while way[-1] in mimicry and len(way) <= len(mimicry):
+            way.append(mimicry[way[-1]])
+        if leader and (name in way or leader not in mimicry):
+            lost.append(name)
+    return lost
 
 
 def _names(root: ElementTree.Element, tag: str) -> tuple[str, ...]:
@@ -311,19 +335,29 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
 
     Without a range ``<limit>`` gives effort and velocity alone.
     """
-
-    def rate(key: str) -> float:
-        [given] = _numbers(element, "limit", key, math.inf)
-        return given if given > 0 else math.inf
-
-    limits = {key: rate(key) for key in ("velocity", "acceleration", "jerk")}
-    limits["acceleration"] = min(limits["acceleration"], rate("deceleration"))
-    limit = element.find("limit")
-    if element.get("type") != "continuous" and limit is not None:
-        [low], [high] = (_numbers(element, "limit", key, 0.0) for key in ("lower", "upper"))
-        if low <= high and {"lower", "upper"} & limit.attrib.keys():
+    given: dict[str, str] = getattr(element.find("limit"), "attrib", {})
+    rates = ("velocity", "acceleration", "deceleration", "jerk")
+    limits: dict[str, Any] = {key: _number(given.get(key, math.inf)) for key in rates}
+    doubts = [f'{key}="{given[key][:20]}"' for key in rates if not limits[key] > 0]
+    limits = {key: rate for key, rate in limits.items() if rate > 0}
+    slowing = limits.pop("deceleration", math.inf)
+    limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
+    low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
+    if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
+        # CAD programs write zeros where nobody has filled in anything
+        if low < high or (low == high and not doubts):
             limits |= {"lower": low, "upper": high}
-    return limits
+        else:
+            doubts.append(f'lower="{given.get("lower", 0)}" upper="{given.get("upper", 0)}"')
+    return limits | {"doubts": tuple(doubts)}
+
+
+def _number(text: str | float) -> float:
+    """What an attribute says, NaN where that is no number."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _mimic(element: ElementTree.Element) -> Mimic | None:
@@ -353,10 +387,9 @@ def _numbers(
     whole = float(np.finfo(np.float32).max) ** 0.5
     largest = whole if tag in ("origin", "mimic") else sys.float_info.max
     if len(values) != len(default) or not all(abs(value) <= largest for value in values):
-        hint = f". {XACRO}" if re.search(r"\$[{(]", text) else ""
         raise DataError(
             f"joint {element.get('name')!r}: <{tag} {attribute}> needs {len(default)} finite "
-            f"number(s) up to {largest:.3g}, got {text[:100]!r}{hint}"
+            f"number(s) up to {largest:.3g}, got {text[:100]!r}"
         )
     return values
 

@@ -181,7 +181,8 @@ def _term(
     joints = state.joints
     jacobian = torch.eye(joints.shape[-1]).to(joints) if at.jacobian is None else at.jacobian
     jacobian = jacobian.expand(*gap.shape, -1)
-    factor, both = torch.linalg.cholesky(covariance), (jacobian, gap[..., None])
+    both = jacobian, gap[..., None]
+    factor = gaussians.cholesky(covariance, "the covariance of an operator")
     white = torch.linalg.solve_triangular(factor, torch.cat(both, -1), upper=False)
     rows, residual = white[..., :-1], white[..., -1:]
     return jacobian, gap, rows.mT @ rows, (rows.mT @ residual)[..., 0]

@@ -1,6 +1,7 @@
 """The page: what its buttons answer, and the whole of it, served."""
 
 import html
+import os
 import re
 import signal
 import subprocess
@@ -125,10 +126,12 @@ def served(tmp_path_factory, bottles):
     folder = tmp_path_factory.mktemp("served") / "mine"
     save_lerobot(bottles, folder, fps=20, task="shake")
     command = [sys.executable, "-c", "from tpgmm_tools.cli import main; main()", "app"]
+    temporary = tmp_path_factory.mktemp("temporary")
     with subprocess.Popen(
         [*command, str(folder), *UPPER_BODY, "--port", "0"],
         stdout=subprocess.PIPE,
         text=True,
+        env=os.environ | {"TMPDIR": str(temporary)},
         # what a shell starts in the background would else ignore Ctrl-C
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
@@ -137,6 +140,8 @@ def served(tmp_path_factory, bottles):
             yield re.fullmatch(r"open (http://127\.0\.0\.1:\d+/) in a browser.*\n", line)[1]
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
+            left = [path for path in temporary.rglob("*") if path.is_file()]
+            assert not left, "the page cleans up"
         finally:
             process.kill()
 

@@ -1,15 +1,17 @@
 """A card says of a model what the model says."""
 
+import html
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from markdown_it import MarkdownIt
 
 from tests.support.skills import small_bottle, waves
 from tests.support.two_ways import Handles, fitted
 from tpgmm_tools.hub import describe
-from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.skills.sequence import Sequence
 from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -67,7 +69,29 @@ def test_text_that_was_given_stays_in_its_cell():
     model = TaskParameterizedGMM(3).fit(waves())
     card = describe(model, measured={"error | of\na <b>hand": 3})
     [*_, row] = rows(card, "Measured")
-    assert row == ["error \\| of a &lt;b>hand", "3"]
+    assert row == ["error \\| of a &lt;b\\>hand", "3"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "[arm](javascript:alert(1))", "![arm](https://elsewhere/x.png)", "https://elsewhere",
+        "www.elsewhere.org", "<img src=x onerror=y>", "&lt;b&gt;", "a`b [c](d:e) `", "a | b",
+        "[arm]: https://elsewhere", "me@elsewhere.org", "_arm_", "**arm**", "arm\n# x", "\\",
+    ],
+)  # fmt: skip
+def test_names_are_shown_as_they_are(name):
+    names = name, f"x{name}", "c"
+    model = TaskParameterizedGMM(3, [Canonical(joints=names[:2])])
+    card = describe(model.fit(waves(names=names)))
+    assert not re.search(
+        r"\w://|www\.|\w@\w", re.sub("`[^`]+`", "", card)
+    )  # which hubs make links of
+    shown = MarkdownIt("commonmark").enable("table").render(card)
+    tags = set(re.findall(r"<(\w+)", shown))
+    assert tags <= {"h2", "p", "table", "thead", "tbody", "tr", "th", "td", "code"}
+    cells = [html.unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", shown)]
+    assert " ".join(name.split()) in cells
 
 
 def test_of_several_ways_and_parts_each_is_described():

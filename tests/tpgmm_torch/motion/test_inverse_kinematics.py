@@ -1,5 +1,6 @@
 """Inverse kinematics by mink: poses are reached and followed within the limits."""
 
+import re
 import sys
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 
 from tests.support.robot_zoo import HANDS, random_joints, upper_body, zoo
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import (
     DataError,
@@ -121,6 +123,32 @@ class TestMissing:
         with pytest.warns(PlausibilityWarning, match=r"'l_hand' is 52\.0 mm, .* pose 0 of 30"):
             follow_poses(self.robot, self.poses(way), self.start, rate=10)
 
+    @pytest.mark.parametrize("seed", range(8))
+    def test_outside_the_limits_it_begins_at_the_nearest_posture_within(
+        self, seed: int
+    ) -> None:
+        robot, rng = self.robot, np.random.default_rng(seed)
+        wanted = robot.lower + 0.1 * (robot.upper - robot.lower)
+        joint, beyond = int(rng.integers(7)), 10.0 ** rng.uniform(-3, 2)
+        start = wanted.clone()
+        start[joint] = robot.lower[joint] - beyond
+        nearest = start.clamp(robot.lower, robot.upper)
+        poses = poses_at(robot, wanted)
+        told = f"'{robot.joint_names[joint]}' at .* its limit {nearest[joint]:.4g}"
+        with pytest.warns(PlausibilityWarning, match=told) as warned:
+            found = reach(robot, poses, start, tolerance=1e-5)
+        assert len(warned) == 1
+        torch.testing.assert_close(found, reach(robot, poses, nearest, tolerance=1e-5))
+        held = {
+            link: Frame(p.position.expand(9, 3), p.orientation.expand(9, 4))
+            for link, p in poses.items()
+        }
+        with pytest.warns(PlausibilityWarning):
+            way = follow_poses(robot, held, start, rate=50)
+        assert way[0].equal(nearest)
+        assert ((way.diff(dim=0) * 50).abs() <= robot.velocity + 1e-6).all()
+        assert ((way >= robot.lower - 1e-9) & (way <= robot.upper + 1e-9)).all()
+
     def test_as_much_as_is_allowed_is_no_miss(self) -> None:
         way = torch.full((30, 3), 0.03, dtype=torch.float64)
         follow_poses(self.robot, self.poses(way), self.start, rate=10, tolerance=0.06)
@@ -134,6 +162,25 @@ class TestRefusing:
         far = {"l_hand": Frame([2.0, 0.0, 0.0])}
         with pytest.raises(DataError, match=r"'l_hand' is .* mm, .* deg away"):
             reach(self.robot, far, self.start)
+        for metres in (1e9, 1e300):  # with which no solver can compute
+            with pytest.raises(DataError, match="no step leads towards"):
+                reach(self.robot, {"l_hand": Frame([metres, 0.0, 0.0])}, self.start)
+
+    @pytest.mark.parametrize("rate", [0, -5, np.nan, np.inf])
+    def test_rates_that_cannot_be(self, rate: float) -> None:
+        poses = {"l_hand": Frame(np.zeros((4, 3)))}
+        with pytest.raises(DataError, match="rate is a positive number"):
+            follow_poses(self.robot, poses, self.start, rate=rate)
+
+    def test_ranges_of_one_point_and_names_of_mujoco_are_no_obstacle(self) -> None:
+        text = upper_body_urdf().replace('"l_hand"', '"world"')
+        robot = Robot.from_urdf(text, ["world"], joints="l_*", dtype=torch.float32)
+        start = robot.joint_tensor(self.start)
+        assert reach(robot, poses_at(robot, start), start).equal(start)
+        text = re.sub(r'lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"', text)
+        still = Robot.from_urdf(text, ["world"], joints="l_*")
+        with pytest.raises(DataError, match="not reached"):
+            reach(still, poses_at(robot, start), np.zeros(7))
 
     def test_links_and_shapes_that_do_not_fit(self) -> None:
         one, many = Frame([0.2, 0.1, 0.1]), Frame(np.zeros((4, 3)))
@@ -143,6 +190,8 @@ class TestRefusing:
             reach(self.robot, {"l_hand": many}, self.start)
         with pytest.raises(ShapeError, match="same number of poses"):
             follow_poses(self.robot, {"l_hand": many, "r_hand": one}, self.start, rate=10)
+        with pytest.raises(ShapeError, match="same number of poses"):
+            follow_poses(self.robot, {"l_hand": many[:0]}, self.start, rate=10)
         with pytest.raises(ShapeError, match="one start"):
             follow_poses(self.robot, {"l_hand": many}, np.zeros((2, 7)), rate=10)
 

@@ -4,7 +4,10 @@ import copy
 import json
 import math
 import pickle
+import random
+import re
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +34,39 @@ from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots import robot as robot_module
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
+from tpgmm_torch.robots.urdf import read_urdf
+
+
+def published() -> list[Any]:
+    """The URDFs of a public collection of which something moves; one file of it is empty."""
+    files = sorted(G1_PATH.parents[2].rglob("*.urdf"))
+    moves = re.compile(rb'type="(revolute|continuous|prismatic)"')
+    return [pytest.param(f, id=f.stem) for f in files if moves.search(f.read_bytes())]
+
+
+@pytest.mark.parametrize("file", published())
+def test_published_robots_are_where_pinocchio_has_them(file: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)
+        model = read_urdf(file)
+        links = random.Random(0).sample(model.links, min(3, len(model.links)))
+        robot = Robot.from_urdf(file, links)
+    leaders = {name: model.leader(name) for name in model.movable if name not in model.actuated}
+    followers = {n: (on.joint, on.multiplier, on.offset) for n, on in leaders.items()}
+    oracle = Pinocchio(pin.buildModelFromUrdf(str(file)), followers)
+    joints = random_joints(robot)
+    state = robot.state(joints)
+    oracle.run(dict(zip(robot.joint_names, joints.tolist(), strict=True)))
+    for index, link in enumerate(links):
+        position, _, jacobian = oracle.link(link, model.root, robot.joint_names)
+        np.testing.assert_allclose(state.position(link), position, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(state.jacobians[index], jacobian.reshape(6, -1), atol=1e-9)
 
 
 class TestOracles:
@@ -212,12 +243,23 @@ class TestSettings:
         assert robot.jerk.tolist()[3:] == [90, math.inf]
         assert robot.to(torch.float32).acceleration.dtype == torch.float32
 
-    def test_what_mimics_a_joint_and_leaves_it_no_room_is_refused(self) -> None:
-        text = ZOO.replace('offset="0.01"', 'offset="3"')
-        with pytest.raises(DataError, match=r"'grip_too', -1 to 1, leave no room to 'grip'"):
-            Robot.from_urdf(text, ("flange",))
-        # it limits no robot whose joint vector leaves the leader out
-        assert Robot.from_urdf(text, ("flange",), joints=["elbow"]).n_joints == 1
+    def test_what_mimics_a_joint_and_leaves_it_no_room_does_not_limit_it(self) -> None:
+        robot = Robot.from_urdf(ZOO.replace('offset="0.01"', 'offset="3"'), ("flange",))
+        assert (robot.lower[3], robot.upper[3]) == (0, 0.1)
+        assert robot.without_limits == ("swivel", "grip")
+
+    def test_limits_that_cannot_be_are_told_once_by_name_where_they_matter(self) -> None:
+        text = ZOO.replace('velocity="0.2"', 'velocity="0"').replace('upper="2"', 'upper="-2"')
+        told = r"'lift': velocity=\"0\"; 'elbow': lower=\"-1\" upper=\"-2\"\. .*bounds="
+        with pytest.warns(PlausibilityWarning, match=told) as warned:
+            robot = Robot.from_urdf(text, ("flange",), joints=["lift", "elbow"])
+            assert robot.to(torch.float32).without_limits == ("lift", "elbow")
+            assert Robot.combine(left=robot).n_joints == 2
+            assert MotionBounds.of(robot).velocity.tolist() == [math.inf, 2]
+        assert len(warned) == 1
+        Robot.from_urdf(text, ("flange",), joints=["swivel"])  # asks for neither
+        with pytest.warns(PlausibilityWarning, match="xacro:x left over"):
+            Robot.from_urdf(ZOO.replace("</robot>", "<xacro:x/></robot>"), ("flange",))
 
     def test_a_forgotten_sign_is_told_and_does_not_hold_the_joint(self) -> None:
         limit = '<limit lower="0" upper="0.1" effort="1" velocity="1"/>'

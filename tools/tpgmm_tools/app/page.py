@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -213,7 +214,7 @@ def show(
     """
     if skill is None:
         return "", "Nothing is learned yet.", []
-    folder = Path(tempfile.mkdtemp(prefix="tpgmm-"))
+    folder = Path(_place().name)
     page = folder / "motion.html"
     try:
         situation = moved(skill.situation(number), places)
@@ -271,7 +272,9 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
         ) from error
     sources = [*(more or {}), GENERATED, UPLOADED]
     with gr.Blocks(
-        title="tpgmm: a skill from demonstrations", analytics_enabled=False
+        title="tpgmm: a skill from demonstrations",
+        analytics_enabled=False,
+        delete_cache=(3600, 86400),  # every hour what is older than a day, and all at the end
     ) as blocks:
         gr.Markdown(INTRODUCTION)
         skill = gr.State()
@@ -320,6 +323,12 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
         given, answer = [skill, number, places], [picture, remarked, taken]
         look.click(show, given, answer, api_name="show", **TURNS)
     return blocks
+
+
+@cache
+def _place() -> tempfile.TemporaryDirectory[str]:
+    """Where the files of the last picture are; it goes when Python ends."""
+    return tempfile.TemporaryDirectory(prefix="tpgmm-")
 
 
 def _names(text: str) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -27,6 +28,8 @@ __all__ = ["describe", "model_card"]
 #: Rows of the table of what matters when.
 SPANS = 8
 #: Settings that a card has elsewhere, or that are of no interest to others.
+#: What Markdown reads: references, links and pictures, addresses, code, emphasis.
+MARKUP = re.compile(r"[\\`*\[\]<>!|~&:@$]|\b_|_\b|(?<=www)\.")
 ELSEWHERE = {"n_components", "operators", "robot", "device"}
 USE = """```python
 from tpgmm_tools import hub
@@ -224,5 +227,8 @@ def _table(heading: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _cell(value: object) -> str:
-    """Text that stays in its cell."""
-    return " ".join(str(value).split()).replace("|", "\\|").replace("<", "&lt;")
+    """Text that stays in its cell, and is neither a link, nor a picture, nor HTML."""
+    text = " ".join(str(value).split())
+    if re.fullmatch("`[^`]+`", text):  # code, which is shown as it is
+        return text.replace("|", "\\|")
+    return MARKUP.sub(r"\\\g<0>", text).replace("\\<", "&lt;")

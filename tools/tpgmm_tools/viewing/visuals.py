@@ -21,7 +21,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
-from tpgmm_torch.robots.urdf import FREEDOMS, UrdfModel, placement, read_urdf
+from tpgmm_torch.robots.urdf import FREEDOMS, UrdfModel, parse_xml, placement, read_urdf
 
 __all__ = ["Color", "Shape", "link_shapes", "mesh", "parse_shape", "unit_ball", "whole_body"]
 
@@ -113,7 +113,7 @@ def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[
     DataError
         If a visual is not one that URDF knows, or a mesh is not in the folder.
     """
-    root = ElementTree.fromstring(model.text)
+    root = parse_xml(model.text)
     materials = {m.get("name"): m for m in root.findall("material")}
     visuals = {str(link.get("name")): link.findall("visual") for link in root.findall("link")}
     plain = not any(visuals.values())
