@@ -287,8 +287,8 @@ def _separated(file: Any) -> pd.DataFrame:
     comma = mark != "," and re.search(r"\d,\d", row)
     # by default pandas is quicker and wrong in the last digit, and takes the first column for
     # names of rows where these are longer than the header
-    options = {"decimal": "," if comma else ".", "float_precision": "round_trip"}
-    options |= {"sep": mark, "index_col": False, "skipinitialspace": True}
+    options: dict[str, Any] = {"decimal": "," if comma else ".", "index_col": False}
+    options |= {"sep": mark, "skipinitialspace": True, "float_precision": "round_trip"}
     pandas = _pandas()
     with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
         read = pandas.read_csv(file, **options)
