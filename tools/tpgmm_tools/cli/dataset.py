@@ -86,11 +86,11 @@ def check(
         typer.echo(problem)
     if problems:
         raise typer.Exit(1)
+    # all problems in one go, not the first
+    recording = data.opened(path, described.read(), relax=CHECKS)
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
-    # all problems in one go, not the first
-    recording = data.opened(path, described.read(), relax=CHECKS)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
