@@ -142,9 +142,10 @@ def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
     time = torch.arange(100, dtype=torch.float64) / 20
     given = situations(observed, time)
     [wanted] = reproduced(small_bottle().skill, given, bounds="robot", blend=1.0)
-    # whenever a chunk comes, it goes on from what was sent before
+    # whenever a chunk comes, it goes on from what was sent before, or from where it would be
+    # by now if the thread was late: a few ticks on
     step = np.abs(np.diff(moved, axis=0)).max()
-    assert step < 2 * float(wanted.joints.diff(dim=0).abs().max())
+    assert step < 5 * float(wanted.joints.diff(dim=0).abs().max())
     # it begins at the skill's first instants; which one, a thread's delay decides
     first = np.abs(wanted.joints[:60].numpy() - moved[0]).max(axis=1)
     assert first.min() < 0.05

@@ -36,6 +36,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
@@ -57,7 +58,7 @@ from tpgmm_torch.control.reach import Fade, nearest
 from tpgmm_torch.control.situations import completed_frames, report_start
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follow import Following
 from tpgmm_torch.motion.follower import Follower, Seconds
@@ -281,6 +282,11 @@ class Controller:
         ------
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
+
+        Warns
+        -----
+        PlausibilityWarning
+            If ``dt`` is more than a second, with ``trust``.
         """
         tick = self._timed(dt)
         if tick is None:
@@ -340,6 +346,8 @@ class Controller:
         if isinstance(seconds, float) and seconds == 0:
             return None
         if self._trusts:
+            if np.max(seconds) > 2 * LONGEST_TICK:
+                warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
             seconds = np.minimum(seconds, LONGEST_TICK)
         return _Tick(seconds, late, False)
 
@@ -561,6 +569,10 @@ class Controller:
 
 #: Why a robot is held.
 NOT_INCREASED, NO_ANSWER = "time did not increase", "the model has no finite answer here"
+LONG_TICK = (
+    "dt is more than a second: it is in seconds, not in milliseconds; after a pause of the "
+    "loop, the skill goes on as if half a second had passed"
+)
 
 
 def _novelty(

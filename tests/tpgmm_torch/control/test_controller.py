@@ -18,7 +18,7 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Frame, Robot, Situation, TaskParameterizedGMM
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.sensing.trust import Trust
@@ -187,6 +187,15 @@ def test_time_that_does_not_increase_moves_nothing(dt):
     assert torch.equal(command.reference, before)
     assert torch.equal(controller.time, time)
     assert controller.step(0.01).status == ["running"] * 2
+
+
+def test_a_tick_of_more_than_a_second_is_told():
+    controller = watched(Problem.of(CASES["the paper's"], 3, 2))
+    controller.step(0.01)
+    before = controller.time
+    with pytest.warns(PlausibilityWarning, match="in seconds, not in milliseconds"):
+        controller.step(33)
+    assert bool((controller.time <= before + 0.5).all())
 
 
 def test_robots_may_have_times_of_their_own():
