@@ -271,9 +271,10 @@ class Robot(Described):
         """
         if not robots or not all(isinstance(robot, Robot) for robot in robots.values()):
             raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
-        for name in set(poses or ()) - set(robots):
+        poses, fixed = dict(poses or {}), dict(fixed or {})
+        for name in set(poses) - set(robots):
             raise UnknownNameError("robot", name, "the robots to combine", robots)
-        roots, places = _poses(fixed or {}, fixed or ()), _poses(poses or {}, robots)
+        roots, places = _poses(fixed, fixed), _poses(poses, robots)
         _check_bases(places)
         for name, robot in robots.items():
             roots[f"{name}_{robot.model.root}"] = places[name].compose(robot._root())
@@ -282,7 +283,7 @@ class Robot(Described):
         options |= {"base": base, "dtype": first.dtype, "device": first.device}
         with warnings.catch_warnings():  # each has told its own doubts
             warnings.simplefilter("ignore", PlausibilityWarning)
-            return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
+            return cls.from_urdf(_mounted(robots, roots, fixed), **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
