@@ -201,10 +201,10 @@ def _check_angles(
         because = f", because {others[0]} and joints have one unit" if others else ""
         raise UnknownUnitsError(
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
-            "units='deg', 'lerobot' (arms in degrees, grippers 0 to 100) or units={'*': 'deg', "
-            "'*gripper': 'raw', name: Scale.calibrated(...), ...} (in commands --units deg, "
-            "--units PATTERN=raw or LeRobot's calibration file; in training --policy.units); "
-            "'raw' takes them as they are",
+            "units='lerobot' (arms in degrees, grippers 0 to 100), 'deg' or units={'*': 'deg', "
+            "'*gripper': 'raw', name: Scale.calibrated(...), ...} (commands: --units lerobot, "
+            "deg, PATTERN=raw or LeRobot's calibration file; training: --policy.units); 'raw' "
+            "takes them as they are",
             column=column,
             **where,
         )

@@ -119,6 +119,8 @@ def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings
 
 
 def _robot(text: str) -> Robot:
+    if "<" not in text and text not in ROBOTS and not Path(text).exists():
+        raise DataError(f"there is no file {text!r}; robots of the package are {[*ROBOTS]}")
     return Robot.from_file(ROBOTS[text]() if text in ROBOTS else text, ())
 
 

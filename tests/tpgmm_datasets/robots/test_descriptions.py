@@ -9,6 +9,7 @@ import torch
 from tests.support.robot_zoo import zoo
 from tpgmm_datasets.robots import bi_so101_urdf, end_links, parse_robot, so101_urdf
 from tpgmm_torch import Frame, Robot, quaternions
+from tpgmm_torch.exceptions import DataError
 
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
@@ -60,6 +61,11 @@ def test_several_robots_are_written_as_text(joined: bool, tmp_path) -> None:
     joints = torch.linspace(-1, 1, both.n_joints).double()
     difference = both.state(joints).positions - expected.state(joints).positions
     assert float(difference.abs().max()) < 1e-12
+
+
+def test_robots_that_are_not_there_are_told_beside_those_that_are() -> None:
+    with pytest.raises(DataError, match=r"no file 'so100'; .*'so101', 'upper_body'"):
+        parse_robot("left=so100@0,0.2,0")
 
 
 def test_the_two_arms_are_named_as_lerobot_names_their_motors() -> None:
