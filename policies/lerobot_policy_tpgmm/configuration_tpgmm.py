@@ -215,6 +215,14 @@ class TPGMMConfig(StatePolicyConfig):
         for names in (self.links, self.state_names, self.action_names, self.environment_names):
             if not all(isinstance(name, str) for name in names or ()):
                 raise DataError(f"names are texts, got {names}")
+        for name, one in {
+            **(self.input_features or {}),
+            **(self.output_features or {}),
+        }.items():
+            if not all(type(size) is int and 0 < size <= 10**6 for size in one.shape):
+                raise DataError(
+                    f"the shape of {name} is of sizes from 1 to a million, got {one.shape}"
+                )
         if self.chunk_size < 1:
             raise DataError(f"chunk_size is at least 1, got {self.chunk_size}")
         if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:

@@ -4,6 +4,7 @@
 ``TPGMM_FUZZ_FIRST`` on.
 """
 
+import copy
 import hashlib
 import json
 import os
@@ -152,7 +153,7 @@ def edit_json(root: Path, rng: np.random.Generator) -> str:
     elif kind == "gone" and holder is not content:
         del holder[key]
     elif kind == "place" and isinstance(holder[key], str | int | float | None):
-        holder[key] = other[there]
+        holder[key] = copy.deepcopy(other[there])
     elif kind == "text":
         holder[key] = str(holder[key])
     elif kind == "longer" and isinstance(holder[key], list):
