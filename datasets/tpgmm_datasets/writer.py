@@ -228,8 +228,7 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
             stored = {**json.loads((meta / "stats.json").read_text(encoding="utf-8"))}
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise DatasetError(f"no statistics: {error}", file="meta/stats.json") from error
-        stored[ENVIRONMENT] = {name: v.tolist() for name, v in whole[ENVIRONMENT].items()}
-        _write_json(meta / "stats.json", stored)
+        _write_json(meta / "stats.json", {**stored, **whole})
         _write_json(meta / "info.json", {**layout.info, "features": features})
     return out
 
@@ -256,15 +255,14 @@ def _rewrite(old: Path, new: Path, file: Path, columns: Mapping[str, Any]) -> No
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=4), encoding="utf-8")
+    text = json.dumps(content, indent=4, default=np.ndarray.tolist)
+    path.write_text(text, encoding="utf-8")
 
 
 def _tasks(task: str | Sequence[str], count: int) -> list[str]:
     tasks = [task] * count if isinstance(task, str) else list(task)
     if len(tasks) != count or not all(isinstance(item, str) and item for item in tasks):
-        raise DatasetError(
-            f"task is one text or one per demonstration ({count}), not empty; got {task!r}"
-        )
+        raise DatasetError(f"task is one text or {count} (one each), not empty; got {task!r}")
     return tasks
 
 
@@ -275,10 +273,8 @@ def _commanded(
     if actions is None:
         return [None] * len(demonstrations)
     if len(actions) != len(demonstrations):
-        raise DatasetError(
-            f"there are actions of {len(actions)} and joints of {len(demonstrations)} "
-            "demonstrations"
-        )
+        counts = f"actions of {len(actions)} and joints of {len(demonstrations)}"
+        raise DatasetError(f"there are {counts} demonstrations")
     pairs = zip(demonstrations, actions, strict=True)
     return check_demonstrations([replace(item, joints=action) for item, action in pairs])
 
@@ -291,22 +287,22 @@ def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
     features = {**new["features"]}
     # an event that none of the new demonstrations has stays a column
     features |= {k: v for k, v in info["features"].items() if k.startswith("event.")}
-    pairs = [(name, new[name], info[name]) for name in ("codebase_version", "fps")]
-    pairs.append(
-        ("robot_type", new["robot_type"] or info.get("robot_type"), info.get("robot_type"))
-    )
-    pairs.append(("features", sorted(features), sorted(info["features"])))
-    for name, given, present in pairs:
-        if given != present:
-            raise DatasetError(f"the set has {name} {present!r}, the demonstrations {given!r}")
+    shown = {**new, "robot_type": new["robot_type"] or info.get("robot_type")}
+    _check_alike(shown, info, ("codebase_version", "fps", "robot_type"))
+    keys, there = ({"features": sorted(each)} for each in (features, info["features"]))
+    _check_alike(keys, there, ["features"])
     for key, feature in features.items():
-        for name in ("dtype", "shape", "names"):
-            if feature[name] != (present := info["features"][key].get(name)):
-                message = (
-                    f"the set has {name} {present!r}, the demonstrations {feature[name]!r}"
-                )
-                raise DatasetError(message, column=key)
+        _check_alike(feature, info["features"][key], ("dtype", "shape", "names"), key)
     return info
+
+
+def _check_alike(
+    new: Mapping[str, Any], old: Mapping[str, Any], names: Sequence[str], key: str | None = None
+) -> None:
+    for name in names:
+        if new[name] != old.get(name):
+            message = f"the set has {name} {old.get(name)!r}, the demonstrations {new[name]!r}"
+            raise DatasetError(message, column=key)
 
 
 class _Writer:
@@ -384,10 +380,7 @@ class _Writer:
         index = pd.Index(self.tasks, name="task")
         tasks = pd.DataFrame({"task_index": np.arange(len(self.tasks))}, index=index)
         tasks.to_parquet(meta / "tasks.parquet", write_page_checksum=True)
-        statistics = {
-            key: {name: values.tolist() for name, values in column.items()}
-            for key, column in (self.statistics or {}).items()
-        }
+
         self.info |= {
             "total_episodes": self.episodes,
             "total_frames": self.rows,
@@ -395,7 +388,7 @@ class _Writer:
             "splits": {"train": f"0:{self.episodes}"},
         }
         _write_json(meta / "info.json", self.info)
-        _write_json(meta / "stats.json", statistics)
+        _write_json(meta / "stats.json", self.statistics or {})
 
 
 def _episode_type(key: str) -> pa.DataType:

@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.layout import Feature
+from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature
 from tpgmm_datasets.names import POSE_PARTS
 from tpgmm_datasets.units import POSE_UNITS, with_pose_units
 from tpgmm_torch.data.arrays import as_array
@@ -38,6 +38,7 @@ __all__ = [
     "pose_values",
     "with_frames",
 ]
+
 
 Array = np.ndarray[Any, Any]
 Features = dict[str, dict[str, Any]]
@@ -81,7 +82,7 @@ def features_of(
             raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")
         features[EVENT + event] = {"dtype": "bool", "shape": [1], "names": None}
     features[ACTION] = joints
-    for key in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
+    for key in BOOKKEEPING:
         kind = "float32" if key == "timestamp" else "int64"
         features[key] = {"dtype": kind, "shape": [1], "names": None}
     return features
@@ -97,10 +98,8 @@ def with_frames(
     DatasetError
         If one of the frames is there already.
     """
-    names, units = (
-        [f"{f}.{part}" for f in frames for part in POSE_PARTS],
-        POSE_UNITS * len(frames),
-    )
+    names = [f"{frame}.{part}" for frame in frames for part in POSE_PARTS]
+    units = POSE_UNITS * len(frames)
     if old is not None:
         before = old.names or tuple(map(str, range(old.width)))
         if {*before} & {*names}:
@@ -140,14 +139,13 @@ def demonstration_columns(
             "tpgmm_datasets.resample(demonstration, fps)"
         )
     joints = as_array(demonstration.joints)
-    columns: dict[str, Array] = {
-        STATE: joints,
-        ACTION: np.concatenate((joints[1:], joints[-1:])),
-    }
+    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
     if demonstration.frames:
-        columns[ENVIRONMENT] = np.concatenate(
-            [pose_values(demonstration.frame(n), steps) for n in _frame_order(features)], axis=1
-        )
+        order = [
+            n.removesuffix(".x") for n in features[ENVIRONMENT]["names"][:: len(POSE_PARTS)]
+        ]
+        poses = [pose_values(demonstration.frame(name), steps) for name in order]
+        columns[ENVIRONMENT] = np.concatenate(poses, axis=1)
     for key in features:
         if key.startswith(EVENT):
             columns[key] = _flag(demonstration, key.removeprefix(EVENT), fps)
@@ -179,11 +177,6 @@ def frame_columns(
     return {ENVIRONMENT: _cast(joined, features[ENVIRONMENT]["dtype"], ENVIRONMENT, number)}
 
 
-def _frame_order(features: Mapping[str, Any]) -> list[str]:
-    names = features[ENVIRONMENT]["names"]
-    return [name.removesuffix(".x") for name in names[:: len(POSE_PARTS)]]
-
-
 def pose_values(frame: Frame, rows: int) -> Array:
     """Position and quaternion of a frame at each of so many rows, shape (rows, 7)."""
     pose = np.concatenate([as_array(frame.position), as_array(frame.orientation)], axis=-1)
@@ -202,9 +195,8 @@ def _cast(values: Array, dtype: str, key: str, number: int) -> Array:
     with np.errstate(over="ignore"):
         cast: Array = values.astype(dtype)
     if not np.isfinite(cast).all():
-        raise DatasetError(
-            f"demonstration {number} has values beyond the range of {dtype}", column=key
-        )
+        message = f"demonstration {number} has values beyond the range of {dtype}"
+        raise DatasetError(message, column=key)
     return cast
 
 

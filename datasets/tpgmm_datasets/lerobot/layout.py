@@ -183,7 +183,7 @@ def open_layout(root: Path) -> Layout:
         raise DatasetError(message, file=INFO)
     features = _features(info)
     modern = version == "v3.0"
-    rows = _episodes_v3(root) if modern else _episodes_v2(root)
+    rows = _listed_episodes(root) if modern else _json_lines(root, "meta/episodes.jsonl")
     episodes = sorted((_episode(info, *row, modern) for row in rows), key=lambda e: e.index)
     tasks = _tasks(root, modern)
     return Layout(
@@ -203,10 +203,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not (root / INFO).is_file():
         message = f"{root} is not a LeRobot data set: it has no {INFO}"
         raise DatasetError(message, check="missing")
-    info = _json(_bytes(root, INFO), INFO)
-    if not isinstance(info, dict):
-        raise DatasetError("the file does not hold a JSON object", file=INFO)
-    return info
+    return _object(_bytes(root, INFO), INFO)
 
 
 def _bytes(root: Path, file: str) -> bytes:
@@ -216,12 +213,14 @@ def _bytes(root: Path, file: str) -> bytes:
         raise DatasetError(str(error), check="missing", file=file) from error
 
 
-def _json(text: bytes, file: str, line: int | None = None) -> Any:
+def _object(text: bytes, place: str) -> dict[str, Any]:
     try:
-        return json.loads(text)
+        found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        place = "" if line is None else f"line {line}: "
-        raise DatasetError(f"{place}this is not JSON: {error}", file=file) from error
+        raise DatasetError(f"this is not JSON: {error}", file=place) from error
+    if not isinstance(found, dict):
+        raise DatasetError("this is not a JSON object", file=place)
+    return found
 
 
 def _features(info: Mapping[str, Any]) -> dict[str, Feature]:
@@ -240,9 +239,7 @@ def _feature(key: str, entry: Any) -> Feature:
         raise DatasetError(message, file=INFO, column=key)
     width = math.prod(sizes)
     if width > MOST_VALUES and dtype not in CAMERAS:
-        message = (
-            f"a row has {width} values, by its shape {shape!r}; at most {MOST_VALUES} are read"
-        )
+        message = f"a row has {width} values ({shape!r}); at most {MOST_VALUES} are read"
         raise DatasetError(message, file=INFO, column=key)
     extra = entry.get("info")
     units = extra.get("units") if isinstance(extra, dict) else None
@@ -254,43 +251,30 @@ def _feature(key: str, entry: Any) -> Feature:
     return Feature(key, dtype, tuple(sizes), names, listed, misnamed)
 
 
-def _episodes_v3(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _listed_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     files = chunked_files(root / "meta" / "episodes")
     if not files:
-        message = (
-            "there is no list of episodes: the set was never finalised "
-            "(LeRobotDataset.finalize) or was copied in part"
-        )
+        message = "no episodes are listed: never finalised (LeRobotDataset.finalize), or a part"
         raise DatasetError(message, check="missing", file="meta/episodes")
     for path in files:
-        table = read_columns(path, root, EPISODE_COLUMNS)
-        file = str(path.relative_to(root))
-        for row in table.to_pylist():
-            yield file, row
+        for row in read_columns(path, root, EPISODE_COLUMNS).to_pylist():
+            yield str(path.relative_to(root)), row
 
 
-def _episodes_v2(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    for line, row in _json_lines(root, "meta/episodes.jsonl"):
-        yield f"meta/episodes.jsonl, line {line}", row
-
-
-def _json_lines(root: Path, file: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    path = root / file
-    if not path.is_file():
+def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    if not (root / file).is_file():
         raise DatasetError("the file is missing", check="missing", file=file)
     for number, text in enumerate(_bytes(root, file).splitlines(), start=1):
         if text.strip():
-            row = _json(text, file, number)
-            if not isinstance(row, dict):
-                raise DatasetError(f"line {number} is not a JSON object", file=file)
-            yield number, row
+            place = f"{file}, line {number}"
+            yield place, _object(text, place)
 
 
 def _episode(
     info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
 ) -> Episode:
     whole = [name for name in EPISODE_COLUMNS if name != "tasks"]
-    for name in whole if modern else ("episode_index", "length"):
+    for name in whole if modern else whole[:2]:
         if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
             message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
             raise DatasetError(message, file=place, column=name)
@@ -298,14 +282,11 @@ def _episode(
     tasks = row.get("tasks") or ()
     if not all(isinstance(task, str) for task in tasks):
         raise DatasetError(f"tasks are no text: {tasks!r}", file=place, column="tasks")
-    file = _data_file(info, row, modern)
-    if not modern:
-        return Episode(index, length, tuple(tasks), file)
-    start, stop = row["dataset_from_index"], row["dataset_to_index"]
-    if stop - start != length:
+    start = row["dataset_from_index"] if modern else None
+    if modern and (stop := row["dataset_to_index"]) - start != length:
         message = f"the length is {length} but the rows go from {start} to {stop}"
         raise DatasetError(message, file=place, episode=index)
-    return Episode(index, length, tuple(tasks), file, start)
+    return Episode(index, length, tuple(tasks), _data_file(info, row, modern), start)
 
 
 def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) -> Path:
@@ -339,14 +320,14 @@ def _tasks(root: Path, modern: bool) -> tuple[str, ...]:
     if not modern:
         return tuple(str(row.get("task")) for _, row in _json_lines(root, "meta/tasks.jsonl"))
     path = root / "meta" / "tasks.parquet"
-    # pandas writes an index without a name under one of its own
-    for name in ("task", "__index_level_0__"):
-        try:
-            return tuple(map(str, read_columns(path, root, (name,)).column(0).to_pylist()))
-        except DatasetError as error:
-            if error.column != "task":
-                raise
-    return ()
+    try:
+        stored = read_columns(path, root, ("task",))
+    except DatasetError as error:
+        if error.column != "task":
+            raise
+        # pandas writes an index without a name under one of its own
+        stored = read_columns(path, root, ("__index_level_0__",))
+    return tuple(map(str, stored.column(0).to_pylist()))
 
 
 def _contradictions(
@@ -374,7 +355,6 @@ def _contradictions(
     for path in chunked_files(root / "data"):
         if path.relative_to(root) not in listed:
             message = (
-                "no episode of the metadata lies in this file: it is a left-over of another "
-                "set or of an interrupted recording"
+                "no episode lies in this file: a left-over of another or a broken recording"
             )
             yield DatasetError(message, check="metadata", file=path.relative_to(root))
