@@ -38,22 +38,15 @@ __all__ = ["TASK", "CarryAndPut", "before_sliding", "slid", "slide"]
 TASK = "put the bottle on the tray"
 #: Nominal seconds of each phase; 12.3 in all.
 PHASES = MappingProxyType(
-    dict(
-        reach=2.5,
-        close=1.5,
-        hold=0.8,
-        lift=1.0,
-        carry=2.5,
-        lower=1.5,
-        open=0.8,
-        leave=1.2,
-        rest=0.5,
-    )
+    dict(reach=2.5, close=1.5, hold=0.8, lift=1.0, carry=2.5)
+    | dict(lower=1.5, open=0.8, leave=1.2, rest=0.5)
 )
 #: When the bottle slides, after the hands have arrived, and how long [s].
 SLIDE = (0.2, 0.2)
 #: How high the bottle is carried above where it stood and above where it is put [m].
 LIFT = 0.05
+#: The bottle's place on a tray.
+FOOT_ON_TRAY = Frame((0.0, 0.0, FOOT))
 
 
 @dataclass(frozen=True)
@@ -135,8 +128,7 @@ class CarryAndPut(BottleSkill):
         """
         situations = self.situations(n, seed)
         rng = np.random.default_rng((seed, 1))
-        slides = self.slides(n, rng)
-        return self._demonstrations(situations, slides, self._phase_ends(n, rng))
+        return self._demonstrations(situations, self.slides(n, rng), self._phase_ends(n, rng))
 
     def nominal(
         self, situations: Sequence[Situation], slides: NDArray[np.float64] | None = None
@@ -169,7 +161,7 @@ class CarryAndPut(BottleSkill):
         orientation : Tensor of shape (...)
             In radians.
         """
-        return pose_error(bottle, tray.compose(Frame((0.0, 0.0, FOOT))))
+        return pose_error(bottle, tray.compose(FOOT_ON_TRAY))
 
     def _demonstrations(
         self, situations: Sequence[Situation], slides: NDArray[np.float64], ends: Tensor
@@ -182,10 +174,21 @@ class CarryAndPut(BottleSkill):
         state = self.robot.state(starts)
         first = {hand: state.pose(hand) for hand in HANDS}
 
+        def bottle(time: Tensor) -> Frame:
+            arrived = ends[:, list(self.phases).index("close")]
+            slid = ((time - arrived - SLIDE[0]) / SLIDE[1]).clamp(0, 1)
+            grasped, place = bottles.compose(slide(slides)), trays.compose(FOOT_ON_TRAY)
+            ways = {"lift": _above(grasped), "carry": _above(place), "lower": place}
+            pose, progress = between(bottles, grasped, slid), self._timing.progress(time, ends)
+            for phase, end in ways.items():
+                pose = between(pose, end, progress[phase])
+            return pose
+
         def wanted(time: Tensor) -> list[Frame]:
-            progress = self._timing.progress(time, ends)
-            bottle = self._bottle(progress, time, ends, bottles, trays, slides)
-            held = before_sliding(bottle, slides)
+            progress, held = (
+                self._timing.progress(time, ends),
+                before_sliding(bottle(time), slides),
+            )
             poses = []
             for hand in HANDS:
                 away = attached(held, APPROACH_POINT[hand])
@@ -195,39 +198,11 @@ class CarryAndPut(BottleSkill):
             return poses
 
         times, joints = self._follow(starts, wanted, ends)
-        poses = []
-        for time in times[:, None].expand(-1, len(starts)):
-            progress = self._timing.progress(time, ends)
-            poses.append(self._bottle(progress, time, ends, bottles, trays, slides))
-        frames = {"bottle": Frame.stack(poses), "tray": trays}
-        return self._recorded(times, joints, ends, frames)
+        path = Frame.stack([bottle(time.expand(len(starts))) for time in times])
+        return self._recorded(times, joints, ends, {"bottle": path, "tray": trays})
 
     def _events(self, end: Mapping[str, float]) -> dict[str, float]:
         return {"grasp": end["hold"], "put": end["lower"], "rest": end["leave"]}
-
-    def _bottle(
-        self,
-        progress: Mapping[str, Tensor],
-        time: Tensor,
-        ends: Tensor,
-        bottles: Frame,
-        trays: Frame,
-        slides: NDArray[np.float64],
-    ) -> Frame:
-        """Where the bottles are."""
-        begin, length = SLIDE
-        arrived = ends[:, list(self.phases).index("close")]
-        slid = ((time - arrived - begin) / length).clamp(0, 1)
-        grasped = bottles.compose(slide(slides))
-        pose = between(bottles, grasped, slid)
-        place = trays.compose(Frame((0.0, 0.0, FOOT)))
-        for end, phase in (
-            (_above(grasped), "lift"),
-            (_above(place), "carry"),
-            (place, "lower"),
-        ):
-            pose = between(pose, end, progress[phase])
-        return pose
 
 
 def slide(slides: NDArray[np.float64]) -> Frame:

@@ -132,26 +132,28 @@ class BottleExperiment:
         save(model, self.out / "model")
         self.report(f"reproducing, K = {self.n_components}")
         reproductions = _run(model.skill, situations, candidates=True)
-        rows = {
-            f"information form, K = {self.n_components}": measure(reproductions, situations)
-        }
+        results = {f"information form, K = {self.n_components}": reproductions}
         self.report("learning and reproducing, K = 10")
-        rows["information form, K = 10"] = measure(
-            _run(self._model(10).fit(aligned).skill, situations), situations
-        )
+        smaller = self._model(10).fit(aligned).skill
+        results["information form, K = 10"] = _run(smaller, situations)
         for epsilon in EPSILONS:
             name = f"covariance form, epsilon = {epsilon:g}"
             self.report(f"reproducing, {name}")
             printed = replace(model.skill, fusion=CovarianceFusion(epsilon))
-            rows[name] = measure(_run(printed, situations), situations)
+            results[name] = _run(printed, situations)
         self.report("learning and reproducing without orientation")
         position_only = self._model(self.n_components, orientation=False).fit(aligned)
-        ablated = _run(position_only.skill, situations)
-        rows["position only"] = measure(ablated, situations)
-
+        results["position only"] = ablated = _run(position_only.skill, situations)
         self.report("learning and reproducing without time warping")
-        alignment = self._alignment(demonstrations, measure, warping, reproductions, situations)
-
+        linear = LinearTimeNormalization().fit(demonstrations)
+        scaled = linear.transform(demonstrations)
+        others = _run(self._model(self.n_components).fit(scaled).skill, situations)
+        alignment = {
+            "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
+            "linear": _Measure(self.skill, scaled).alignment(
+                demonstrations, linear.paths_, others
+            ),
+        }
         self.report("drawing")
         draw_figures(
             self.out, model, aligned, reproductions[0], ablated[0], situations[0], measure.spans
@@ -159,7 +161,7 @@ class BottleExperiment:
         self.report("writing metrics.json")
         metrics = {
             "settings": self._settings(),
-            "rows": rows,
+            "rows": {name: measure(found, situations) for name, found in results.items()},
             "share of information on the shoulders": measure.shares(reproductions),
             "alignment": alignment,
             "demonstrations": measure.demonstrations(demonstrations),
@@ -177,25 +179,6 @@ class BottleExperiment:
         return load_lerobot(
             path, robot=self.skill.robot, frames={"bottle": "observation.environment_state"}
         )
-
-    def _alignment(
-        self,
-        demonstrations: Sequence[Demonstration],
-        measure: _Measure,
-        warping: DynamicTimeWarping,
-        reproductions: Sequence[Trajectory],
-        situations: Sequence[Situation],
-    ) -> dict[str, Any]:
-        """Dynamic time warping against linear time normalisation."""
-        linear = LinearTimeNormalization().fit(demonstrations)
-        aligned = linear.transform(demonstrations)
-        model = self._model(self.n_components).fit(aligned)
-        others = _run(model.skill, situations)
-        normalised = _Measure(self.skill, aligned)
-        return {
-            "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
-            "linear": normalised.alignment(demonstrations, linear.paths_, others),
-        }
 
     def _model(self, n_components: int, orientation: bool = True) -> TaskParameterizedGMM:
         operators = bottle_operators(orientation)
@@ -224,10 +207,8 @@ class _Measure:
 
     def __init__(self, skill: BottleShaking, aligned: Sequence[Demonstration]) -> None:
         self.skill, self.aligned, self.time = skill, aligned, aligned[0].time
-        grasp, shake, rest = (
-            float(np.mean([d.events[name] for d in aligned]))
-            for name in ("grasp", "shake", "rest")
-        )
+        events = [[one.events[n] for n in ("grasp", "shake", "rest")] for one in aligned]
+        grasp, shake, rest = np.mean(events, axis=0).tolist()
         self.contact = int(torch.searchsorted(self.time, grasp))
         self.spans = {"reach": (0.0, grasp), "shake": (shake, rest)}
         self.shaking = self._window(shake, rest)
@@ -249,25 +230,25 @@ class _Measure:
         """Median and 95th percentile over the situations; the worst where limits count."""
         joints = torch.stack([trajectory.joints for trajectory in trajectories])
         starts = torch.stack([situation.joints for situation in situations])
-        position, orientation = self.skill.grasp_error(
-            joints[:, self.contact],
-            Frame.stack([situation.frames["bottle"] for situation in situations]),
-        )
+        bottles = Frame.stack([situation.frames["bottle"] for situation in situations])
+        grasps = self._grasps(joints[:, self.contact], bottles)
         shoulders = self._shoulders(trajectories)
         residual = (shoulders - self.shoulders)[:, self.shaking]
         wanted = self._rhythm(self.shoulders)
         rhythms = np.array([self._rhythm(motion) for motion in shoulders]) / wanted - 1
         robot = self.skill.robot
         beyond = torch.maximum(robot.lower - joints, joints - robot.upper).clamp(min=0)
-        return {
-            "grasp position error [mm]": _spread(1e3 * position),
-            "grasp orientation error [deg]": _spread(torch.rad2deg(orientation)),
-            "shoulder RMSE [rad]": _spread(residual.square().mean((1, 2)).sqrt()),
-            "frequency error [%]": _spread(100 * np.abs(rhythms[:, 0])),
-            "amplitude error [%]": _spread(100 * np.abs(rhythms[:, 1])),
-            "first step [rad]": float((joints[:, 0] - starts).abs().max()),
-            "beyond joint limits [rad]": float(beyond.max()),
-        } | _pace(trajectories)
+        return (
+            grasps
+            | {
+                "shoulder RMSE [rad]": _spread(residual.square().mean((1, 2)).sqrt()),
+                "frequency error [%]": _spread(100 * np.abs(rhythms[:, 0])),
+                "amplitude error [%]": _spread(100 * np.abs(rhythms[:, 1])),
+                "first step [rad]": float((joints[:, 0] - starts).abs().max()),
+                "beyond joint limits [rad]": float(beyond.max()),
+            }
+            | _pace(trajectories)
+        )
 
     def _rhythm(self, shoulders: Tensor) -> NDArray[np.float64]:
         """Frequency and amplitude, the mean of both shoulders."""
@@ -314,13 +295,16 @@ class _Measure:
             d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))] for d in demonstrations
         ]
         bottles = Frame.stack([d.frames["bottle"] for d in demonstrations])
-        position, orientation = self.skill.grasp_error(torch.stack(contacts), bottles)
         durations = [d.duration for d in demonstrations]
+        found = {"duration [s]": [min(durations), max(durations)]}
+        return found | self._grasps(torch.stack(contacts), bottles) | _pace(demonstrations)
+
+    def _grasps(self, joints: Tensor, bottles: Frame) -> dict[str, Any]:
+        position, orientation = self.skill.grasp_error(joints, bottles)
         return {
-            "duration [s]": [min(durations), max(durations)],
             "grasp position error [mm]": _spread(1e3 * position),
             "grasp orientation error [deg]": _spread(torch.rad2deg(orientation)),
-        } | _pace(demonstrations)
+        }
 
 
 def _pace(motions: Sequence[Trajectory | Demonstration]) -> dict[str, Any]:
@@ -331,9 +315,5 @@ def _pace(motions: Sequence[Trajectory | Demonstration]) -> dict[str, Any]:
 
 
 def _spread(values: Any) -> dict[str, float]:
-    values = np.asarray(values, dtype=np.float64)
-    return {
-        "median": float(np.median(values)),
-        "p95": float(np.percentile(values, 95)),
-        "max": float(values.max()),
-    }
+    found = np.percentile(np.asarray(values, dtype=np.float64), (50, 95, 100))
+    return dict(zip(("median", "p95", "max"), found.tolist(), strict=True))

@@ -49,6 +49,8 @@ GRASP_TURN = (math.cos(-math.pi / 4), 0.0, math.sin(-math.pi / 4), 0.0)
 APPROACH_POINT = {"l_hand": (-0.05, 0.14, 0.0), "r_hand": (-0.05, -0.14, 0.0)}
 #: Height of the bottle's centre above its foot [m].
 FOOT = 0.11
+#: Of the inverse kinematics.
+DAMPING = 1e-3
 #: Where the bottle is brought, upright [m].
 CHEST = np.array((0.24, 0.0, 0.18))
 #: Nominal seconds of each phase; 13 in all, as in the paper.
@@ -107,16 +109,12 @@ class BottleSkill:
     def start_postures(self, n: int, rng: np.random.Generator) -> Tensor:
         """``n`` start postures around the neutral one, shape (n, 17) [rad]."""
         spread = rng.uniform(-self.start_spread, self.start_spread, (n, self.robot.n_joints))
-        joints = self.neutral_posture()
-        return torch.clamp(
-            joints + torch.from_numpy(spread), self.robot.lower, self.robot.upper
-        )
+        joints = self.neutral_posture() + torch.from_numpy(spread)
+        return joints.clamp(self.robot.lower, self.robot.upper)
 
     def usual(self, bottle: Frame) -> bool:
         """Whether a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
-        low, high = (
-            bottle.position.new_tensor(corner) for corner in (self.lowest, self.highest)
-        )
+        low, high = map(bottle.position.new_tensor, (self.lowest, self.highest))
         inside = (low - 1e-9 <= bottle.position) & (bottle.position <= high + 1e-9)
         w, x, y, z = bottle.orientation.tolist()
         turn = math.degrees(2 * math.atan2(z, w))
@@ -142,9 +140,8 @@ class BottleSkill:
         errors = [
             pose_error(state.pose(hand), attached(bottle, GRASP_POINT[hand])) for hand in HANDS
         ]
-        return torch.maximum(*(one for one, _ in errors)), torch.maximum(
-            *(one for _, one in errors)
-        )
+        position, orientation = (torch.maximum(*kind) for kind in zip(*errors, strict=True))
+        return position, orientation
 
     def neutral_posture(self) -> Tensor:
         """The humanoid's published home posture, elbows out and bent, shape (17,) [rad]."""
@@ -422,26 +419,17 @@ def follow_hands(
     limit = robot.velocity * dt
     joints, out = starts, [starts]
     for time in times[1:]:
-        targets = wanted(time.expand(len(starts)))
-        step = _least_squares(robot, joints, targets, weights, posture, dt)
-        joints = torch.clamp(
-            joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
-        )
+        rest = dt * (posture - joints)
+        step = _step(robot, joints, wanted(time.expand(len(starts))), weights, rest)
+        joints = (joints + step.clamp(-limit, limit)).clamp(robot.lower, robot.upper)
         out.append(joints)
     return torch.stack(out)
 
 
-def _least_squares(
-    robot: Robot,
-    joints: Tensor,
-    wanted: list[Frame],
-    weights: Tensor,
-    posture: Tensor,
-    dt: float,
-    damping: float = 1e-3,
-    posture_rate: float = 1.0,
+def _step(
+    robot: Robot, joints: Tensor, wanted: list[Frame], weights: Tensor, rest: Tensor
 ) -> Tensor:
-    """Damped least-squares step to the wanted hand poses; the null space seeks the posture."""
+    """Damped least-squares step to the wanted hand poses; the null space takes ``rest``."""
     state = robot.state(joints)
     errors, rows = [], []
     for hand, target in zip(HANDS, wanted, strict=True):
@@ -452,8 +440,7 @@ def _least_squares(
         rows += [state.linear_jacobian(hand), state.angular_jacobian(hand)]
     error, jacobian = torch.cat(errors, dim=-1), torch.cat(rows, dim=-2)
     weighted = jacobian * weights
-    gram = weighted @ weighted.mT + damping**2 * torch.eye(12, dtype=torch.float64)
-    rest = posture_rate * dt * (posture - joints)
+    gram = weighted @ weighted.mT + DAMPING**2 * torch.eye(12, dtype=torch.float64)
     residual = error - (jacobian @ rest[..., None])[..., 0]
     solved = torch.linalg.solve(gram, residual[..., None])
     return rest + weights * (weighted.mT @ solved)[..., 0]

@@ -139,7 +139,10 @@ def demonstration_columns(
             "tpgmm_datasets.resample(demonstration, fps)"
         )
     joints = as_array(demonstration.joints)
-    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
+    columns: dict[str, Array] = {
+        STATE: joints,
+        ACTION: np.concatenate((joints[1:], joints[-1:])),
+    }
     if demonstration.frames:
         order = [
             n.removesuffix(".x") for n in features[ENVIRONMENT]["names"][:: len(POSE_PARTS)]
