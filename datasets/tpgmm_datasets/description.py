@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ __all__ = ["ColumnInfo", "DatasetInfo", "describe_lerobot"]
 
 
 @dataclass(frozen=True)
-class ColumnInfo:
+class ColumnInfo(Feature):
     """A numeric column of a data set.
 
     Parameters
@@ -32,21 +32,18 @@ class ColumnInfo:
     shape : tuple of int
         Of a row's value.
     names : tuple of str or None
-        One per value, where the metadata give them.
+        One per value, where the metadata give them so that they can be used.
     units : tuple of str or None
         One per value: those declared; for the joints of a set that declares none, a guess
         with a question mark, the same for all but grippers.
+    misnamed : str
+        Why the names cannot be used.
     low, high : tuple of float or None
         Range of each value over the episodes without problems; None if there are none.
     """
 
-    key: str
-    dtype: str
-    shape: tuple[int, ...]
-    names: tuple[str, ...] | None
-    units: tuple[str, ...] | None
-    low: tuple[float, ...] | None
-    high: tuple[float, ...] | None
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -169,25 +166,16 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
 def _column(
     feature: Feature, extremes: tuple[Any, Any] | None, joints: str | None
 ) -> ColumnInfo:
-    units = feature.units
-    low = high = None
-    if extremes is not None:
-        low, high = (tuple(map(float, values)) for values in extremes)
-        if units is None and feature.key == joints:
-            names = feature.names or ("",) * len(low)
-            # the joints of a feature have one unit, grippers may have their own
-            joint = [
-                (a, b)
-                for name, a, b in zip(names, low, high, strict=True)
-                if not is_gripper(name)
-            ]
-            lows, highs = zip(*joint, strict=True) if joint else ((0.0,), (0.0,))
-            common = guess_unit(min(lows), max(highs))
-            guesses = [
-                f"{guess_unit(a, b) if is_gripper(name) else common}?"
-                for name, a, b in zip(names, low, high, strict=True)
-            ]
-            units = with_pose_units(feature.names, guesses)
-    return ColumnInfo(
-        feature.key, feature.dtype, feature.shape, feature.names, units, low, high
-    )
+    if extremes is None:
+        return ColumnInfo(**vars(feature))
+    low, high = (tuple(map(float, values)) for values in extremes)
+    column = ColumnInfo(**vars(feature), low=low, high=high)
+    if feature.units is not None or feature.key != joints:
+        return column
+    apart = [is_gripper(name) for name in feature.names or ("",) * len(low)]
+    # the joints of a feature have one unit, grippers may have their own
+    alike = [value for value, own in zip(low + high, apart * 2, strict=True) if not own]
+    common = guess_unit(min(alike, default=0.0), max(alike, default=0.0))
+    ranges = zip(low, high, apart, strict=True)
+    guesses = [f"{guess_unit(a, b) if own else common}?" for a, b, own in ranges]
+    return replace(column, units=with_pose_units(feature.names, guesses))

@@ -331,18 +331,13 @@ def doubtful_events(
     findings = []
     for name in dict.fromkeys(name for _, name, _ in doubtful):
         where = {index: sure for index, other, sure in doubtful if other == name}
-        findings.append(
-            Finding(
-                "events",
-                f"{name!r} is not found with confidence {LEAST_CONFIDENCE} in {among}s "
-                f"{', '.join(map(str, where))} (there {min(where.values()):.3f} to "
-                f"{max(where.values()):.3f})",
-                "Leave them out, look for it in other signals, or say when it is",
-                (name,),
-                tuple(where),
-                min(where.values()),
-            )
+        low, high, there = min(where.values()), max(where.values()), ", ".join(map(str, where))
+        message = (
+            f"{name!r} is not found with confidence {LEAST_CONFIDENCE} in {among}s {there} "
+            f"(there {low:.3f} to {high:.3f})"
         )
+        remedy = "Leave them out, look for it in other signals, or say when it is"
+        findings.append(Finding("events", message, remedy, (name,), tuple(where), low))
     return findings
 
 

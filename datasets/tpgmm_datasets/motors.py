@@ -138,17 +138,14 @@ def estimate_motor_map(
     (-1, 20.0)
     """
     names = tuple(robot.joint_names if names is None else names)
-    stored = match_names(robot.joint_names, names, "")
-    motor_of = {joint: motor for motor, joint in stored.items()}
-    motors = [motor_of[joint] for joint in robot.joint_names]
+    stored = {joint: name for name, joint in match_names(robot.joint_names, names, "").items()}
+    motors = [stored[joint] for joint in robot.joint_names]
     table = as_tensor(values, "values").to(robot.lower)
     n = len(poses.position) if poses.batch_shape else 0
     if table.shape != (n, len(names)) or not n:
-        raise DatasetError(
-            f"values of {len(names)} motors at n postures have the shape (n, {len(names)}), "
-            f"and there are n poses; got values {tuple(table.shape)}, poses "
-            f"{tuple(poses.batch_shape)}"
-        )
+        got = f"values {tuple(table.shape)}, poses {tuple(poses.batch_shape)}"
+        wanted = f"have the shape (n, {len(names)}), and there are n poses; got {got}"
+        raise DatasetError(f"values of {len(names)} motors at n postures {wanted}")
     if wrong := [motor for motor in known if motor not in motors]:
         raise DatasetError(f"known motors {wrong} are not among {motors}")
     given = units if isinstance(units, Mapping) else dict.fromkeys(names, units)
@@ -170,18 +167,17 @@ def estimate_motor_map(
     errors = problem.errors(signs[best], offsets[best])
     labels = [motors[i] for i in chosen]
     _check(labels, signs, cost, best, errors, problem.rows)
-    turns = dict(zip(labels, signs[best].int().tolist(), strict=True))
     # a half turn to either side is the same angle
     wrapped = math.pi - torch.remainder(math.pi - offsets[best], math.tau)
-    shifts = dict(zip(labels, wrapped.tolist(), strict=True))
-    scales |= {
-        m: Scale(turns[m] * scales[m].factor, turns[m] * scales[m].offset + shifts[m])
-        for m in labels
-    }
-    uncertainty = dict(zip(labels, errors.tolist(), strict=True))
-    return MotorMap(
-        scales, turns, shifts, uncertainty, *problem.misfit(signs[best], offsets[best])
+    turns, shifts, uncertainty = (
+        dict(zip(labels, column.tolist(), strict=True))
+        for column in (signs[best].int(), wrapped, errors)
     )
+    for motor, turn in turns.items():
+        factor, offset = scales[motor].factor, scales[motor].offset
+        scales[motor] = Scale(turn * factor, turn * offset + shifts[motor])
+    left = problem.misfit(signs[best], offsets[best])
+    return MotorMap(scales, turns, shifts, uncertainty, *left)
 
 
 def _check(

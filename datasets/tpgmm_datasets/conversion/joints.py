@@ -68,7 +68,7 @@ class JointColumns:
 
     def values(self, stored: np.ndarray[Any, Any], **where: Any) -> np.ndarray[Any, Any]:
         """Stored values (T, width) in radians and metres."""
-        called = self.feature.names or self.names or _numbered(self.feature)
+        called = self.feature.names or self.names or self.feature.called
         return convert(stored, called, self.units, self.feature.key, **where)
 
 
@@ -155,24 +155,20 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
     if names is None and count == len(robot.joint_names) == 1:
         names = tuple(robot.joint_names)
     if names is None:
+        joints = f"the robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}"
         message = (
-            f"the set does not name its {count} values, and nothing else tells which are the "
-            f"robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}. {NAME_ALL}"
+            f"the set does not name its {count} values, nor say which are {joints}. {NAME_ALL}"
         )
         raise DatasetError(message, column=feature.key)
     matched = match_names(robot.joint_names, names, feature.key)
     return tuple(matched.get(name, name) for name in names)
 
 
-def _numbered(feature: Feature) -> tuple[str, ...]:
-    return tuple(f"value {i}" for i in range(feature.width))
-
-
 def _units(
     feature: Feature, final: Sequence[str] | None, units: Units, robot: Any
 ) -> tuple[Unit, ...]:
     """A unit may be given by the data set's name or by the robot's."""
-    final = final or _numbered(feature)
+    final = final or feature.called
     stored = feature.names or final
     declared = feature.units or ("auto",) * feature.width
     chosen = units_of(units, stored, final, robot, feature.key)
@@ -184,18 +180,10 @@ def _units(
         and as_scale(unit, feature.key) != as_scale(declares, feature.key)
     ]
     if others:
-        warnings.warn(
-            f"column {feature.key!r}: the set declares {', '.join(others)}; what was given "
-            "counts",
-            DatasetWarning,
-            stacklevel=2,
-        )
-    chosen = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
-    if robot is not None:
-        # other values are only seen by functions that find events
-        mine = set(robot.joint_names)
-        chosen = [
-            "raw" if c == "auto" and f not in mine else c
-            for c, f in zip(chosen, final, strict=True)
-        ]
-    return tuple(chosen)
+        differ = f"the set declares {', '.join(others)}; what was given counts"
+        warnings.warn(f"column {feature.key!r}: {differ}", DatasetWarning, stacklevel=2)
+    # values of no joint are only seen by functions that find events
+    mine = {*(final if robot is None else robot.joint_names)}
+    told = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
+    pairs = zip(told, final, strict=True)
+    return tuple("raw" if unit == "auto" and f not in mine else unit for unit, f in pairs)

@@ -75,6 +75,11 @@ class Feature:
         return math.prod(self.shape)
 
     @property
+    def called(self) -> tuple[str, ...]:
+        """What messages call its values."""
+        return self.names or tuple(f"value {i}" for i in range(self.width))
+
+    @property
     def is_camera(self) -> bool:
         """Whether it is a video or image, which this project does not read."""
         return self.dtype in CAMERAS
