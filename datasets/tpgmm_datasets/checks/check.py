@@ -11,6 +11,7 @@ import torch
 
 from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
 from tpgmm_datasets.checks.outliers import outliers
+from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
@@ -124,43 +125,38 @@ def _time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     if 0 < usual < QUICKEST_STEP:
         message = f"time is in seconds, and a typical step of it is {usual:.3g} s"
         yield Finding("time", message, "Is it in another unit? Convert it", value=usual)
-    gaps = {
-        i: one.gap
+    gaps = [
+        ("{:.3g} s after {:.4g} s of demonstration {}".format(*one.gap, i), i, "")
         for i, one in enumerate(episodes)
         if one.gap[0] > max(GAP_STEPS * one.step, GAP, GAP_SHARE * one.duration)
-    }
-    if gaps:
-        spans = [
-            f"{g:.3g} s after {at:.4g} s of demonstration {i}" for i, (g, at) in gaps.items()
-        ]
-        message = f"nothing was recorded for {listed(spans)}"
-        yield Finding("gaps", message, "Leave the episode out, or cut it", (), tuple(gaps))
+    ]
+    remedy = "Leave the episode out, or cut it"
+    yield from found_at("gaps", "nothing was recorded for", remedy, gaps)
     durations = np.array([max(episode.duration, 1e-9) for episode in episodes])
-    if odd := outliers(np.log(durations), floor=np.log(SAME_DURATION)):
-        places = listed([f"{durations[i]:.4g} s in demonstration {i}" for i in odd])
-        message = f"demonstrations last about {np.median(durations):.4g} s, but {places}"
-        remedy = "Is it the same skill, whole, and at the same rate?"
-        yield Finding("durations", message, remedy, (), tuple(odd), float(durations[odd[0]]))
+    odd = outliers(np.log(durations), floor=np.log(SAME_DURATION))
+    places = [(f"{durations[i]:.4g} s in demonstration {i}", i, "") for i in odd]
+    message = f"demonstrations last about {np.median(durations):.4g} s, but"
+    remedy = "Is it the same skill, whole, and at the same rate?"
+    most = float(durations[odd[0]]) if odd else np.nan
+    yield from found_at("durations", message, remedy, places, most)
 
 
 def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     """Events at another phase than usual, missing, or in another order."""
     names = list(dict.fromkeys(name for one in episodes for name in one.events))
     places: list[str] = []
-    about: dict[int, None] = {}
+    about: set[int] = set()
     for name in names:
         phases = {i: one.events[name] for i, one in enumerate(episodes) if name in one.events}
         there, values = list(phases), np.array(list(phases.values()))
         usual = float(np.median(values))
-        for i in sorted(there[k] for k in outliers(values, floor=SAME_PHASE)):
-            places.append(
-                f"{name!r} at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}"
-            )
-            about[i] = None
+        odd = sorted(there[k] for k in outliers(values, floor=SAME_PHASE))
+        at = [f"at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}" for i in odd]
         lost = [i for i in range(len(episodes)) if i not in phases]
         if lost and len(lost) < len(there):
-            places.append(f"{name!r} missing in {listed([str(i) for i in lost])}")
-            about |= dict.fromkeys(lost)
+            at, odd = [*at, f"missing in {listed([str(i) for i in lost])}"], [*odd, *lost]
+        places += [f"{name!r} {text}" for text in at]
+        about.update(odd)
     if places:
         message = f"events are not where they usually are: {listed(places)}"
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
@@ -181,16 +177,13 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
 
 def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     first: dict[str, int] = {}
-    pairs = [
-        (i, first[one.digest])
+    copies = [
+        (f"demonstration {i} is a copy of {first[one.digest]}", i, "")
         for i, one in enumerate(episodes)
         if i != first.setdefault(one.digest, i) and np.ptp(one.path) > 0
     ]
-    if pairs:
-        places = listed([f"demonstration {b} is a copy of {a}" for b, a in pairs])
-        message = f"some were recorded once and counted twice: {places}"
-        remedy = "Leave the copies out: they make the model more certain than it may be"
-        yield Finding("copies", message, remedy, (), tuple(b for b, _ in pairs))
+    remedy = "Leave the copies out: they make the model more certain than it may be"
+    yield from found_at("copies", "some were recorded once and counted twice:", remedy, copies)
 
 
 def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Iterator[Finding]:
@@ -204,27 +197,29 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
         _cosines(np.diff(p, axis=1), np.diff(median, axis=0)) for p in (paths, paths[:, ::-1])
     )
     reverse = np.flatnonzero(turned > np.maximum(ALONG, along + BACKWARDS)).tolist()
-    if reverse:
-        places = [f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})" for i in reverse]
-        message = f"paths go along the median path if they run backwards: {listed(places)}"
-        remedy = "Are they stored in reverse, or another skill? Leave them out"
-        yield Finding("episodes", message, remedy, (), tuple(reverse))
+    places = [
+        (f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})", i, "") for i in reverse
+    ]
+    message = "paths go along the median path if they run backwards:"
+    remedy = "Are they stored in reverse, or another skill? Leave them out"
+    yield from found_at("episodes", message, remedy, places)
     if len(episodes) < FEWEST_PATHS:
         return
     squares = (paths - median) ** 2
     distances = np.sqrt(squares.mean(axis=(1, 2)))
     typical = float(np.median(distances))
     far = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
-    if odd := [i for i in far if i not in reverse]:
-        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(paths.shape[-1]))
-        most = {i: names[int(squares[i].mean(axis=0).argmax())] for i in odd}
-        places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
-        message = (
-            "paths differ from the median path, in ranges of the joints, by about "
-            f"{typical:.2g}, but {listed(places)}"
-        )
-        remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
-        yield Finding("episodes", message, remedy, tuple({*most.values()}), tuple(odd))
+    names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(paths.shape[-1]))
+    most = [names[j] for j in squares.mean(axis=1).argmax(axis=1)]
+    places = [
+        (f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})", i, most[i])
+        for i in far
+        if i not in reverse
+    ]
+    usual = f"in ranges of the joints, by about {typical:.2g}"
+    message = f"paths differ from the median path, {usual}, but"
+    remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
+    yield from found_at("episodes", message, remedy, places)
 
 
 def _cosines(steps: Array, usual: Array) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
+from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
 from tpgmm_torch.checks.report import Finding, listed
@@ -91,8 +92,7 @@ def _units(
     largest = np.maximum(-low, high)
     odd = sorted((i for i in angles if largest[i] > limit), key=lambda i: -largest[i])
     if odd:
-        unlimited = np.full((2, len(low)), np.inf)
-        places = ranges(names, odd, low, high, unlimited * [[-1], [1]])
+        places = ranges(names, odd, low, high, np.full((2, len(low)), np.inf))
         message = (
             f"joints are in radians (metres, where they slide), these hardly are: {places}"
         )
@@ -131,17 +131,13 @@ def _steps(
         "jumps": ("like no other of that joint", lost),
     }
     for check, (what, remedy) in kinds.items():
-        places, joints, about = [], dict[str, None](), dict[int, None]()
-        for i, episode in enumerate(episodes):
-            for j, at, size in getattr(episode, check):
-                if j in angles:
-                    places.append(
-                        f"{names[j]!r} by {size:.3g} at {at:.4g} s of demonstration {i}"
-                    )
-                    joints[names[j]] = about[i] = None
-        if places:
-            message = f"there are steps {what}: {listed(places)}"
-            yield Finding(check, message, remedy, tuple(joints), tuple(about))
+        places = [
+            (f"{names[j]!r} by {size:.3g} at {at:.4g} s of demonstration {i}", i, names[j])
+            for i, episode in enumerate(episodes)
+            for j, at, size in getattr(episode, check)
+            if j in angles
+        ]
+        yield from found_at(check, f"there are steps {what}:", remedy, places)
 
 
 def _clipped(
@@ -171,13 +167,10 @@ def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterat
     still = np.where(ranges <= 1e-9, 1.0, np.stack([one.still for one in episodes]))
     usual = np.median(ranges, axis=0)
     stuck = (still > STUCK) & (np.median(still, axis=0) < USUALLY_STILL) & (usual > MOVING)
-    odd = {(int(e), names[j]): (still[e, j], usual[j]) for e, j in np.argwhere(stuck)}
-    if odd:
-        places = [
-            f"{name!r} of demonstration {e} for {share:.0%} of it, usually moves by {most:.2g}"
-            for (e, name), (share, most) in odd.items()
-        ]
-        message = f"joints keep one value while the others move: {listed(places)}"
-        remedy = "Was a sensor or a motor off? Leave the episode out"
-        joints, about = (dict.fromkeys(column) for column in zip(*odd, strict=True))
-        yield Finding("stuck", message, remedy, tuple(about), tuple(joints))
+    shares = [f"for {share:.0%} of it, usually moves by" for share in still[stuck]]
+    places = [
+        (f"{names[j]!r} of demonstration {e} {share} {usual[j]:.2g}", e, names[j])
+        for share, (e, j) in zip(shares, np.argwhere(stuck).tolist(), strict=True)
+    ]
+    remedy = "Was a sensor or a motor off? Leave the episode out"
+    yield from found_at("stuck", "joints keep one value while others move:", remedy, places)

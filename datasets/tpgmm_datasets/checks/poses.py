@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.checks.outliers import set_apart
+from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.report import Finding
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
@@ -61,16 +62,14 @@ def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
     odd = {*set_apart(distances, NEAR), *(lost.tolist() if len(lost) < len(first) / 2 else ())}
     if odd:
         within = float(np.delete(distances, [*odd]).max())
+        centre, *spots = (", ".join(f"{x:.3g}" for x in place) for place in (usual, *first))
         places = [
-            f"{distances[i]:.3g} m away in demonstration {i} "
-            f"({', '.join(f'{x:.3g}' for x in first[i])})"
+            (f"{distances[i]:.3g} m away in demonstration {i} ({spots[i]})", i, name)
             for i in sorted(odd)
         ]
-        centre = ", ".join(f"{x:.3g}" for x in usual)
-        message = f"frame {name!r} is usually within {within:.2g} m of ({centre}), but "
+        message = f"frame {name!r} is usually within {within:.2g} m of ({centre}), but"
         remedy = "Was the object tracked, and in the same base frame? Leave the episode out"
-        about = tuple(sorted(odd))
-        yield Finding("frames", message + listed(places), remedy, (name,), about)
+        yield from found_at("frames", message, remedy, places)
 
 
 def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
@@ -108,31 +107,23 @@ def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
     angles = 2 * np.arccos(np.abs(turns @ some.T).clip(max=1))
     angles = angles[:, np.median(angles[: len(some)], axis=0).argmin()]
     if odd := set_apart(angles, ALIKE):
-        places = [f"by {np.rad2deg(angles[i]):.0f} deg in demonstration {i}" for i in odd]
-        message = (
-            f"frame {name!r} is turned unlike in the others, {listed(places)}, usually within "
-            f"{np.rad2deg(np.delete(angles, odd).max()):.0f} deg"
-        )
+        degrees = np.rad2deg(angles)
+        places = [(f"by {degrees[i]:.0f} deg in demonstration {i}", i, name) for i in odd]
+        usual = f"usually within {np.delete(degrees, odd).max():.0f} deg"
+        message = f"frame {name!r} is {usual}, but turned unlike in the others"
         remedy = "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out"
-        yield Finding("frames", message, remedy, (name,), tuple(odd))
+        yield from found_at("frames", message, remedy, places)
 
 
 def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    leaps = {i: (*episode.leaps[name], episode.step) for i, episode in enumerate(episodes)}
-    odd = {
-        i: (size, at)
-        for i, (size, usual, at, step) in leaps.items()
+    leaps = [(*episode.leaps[name], episode.step) for episode in episodes]
+    places = [
+        (f"by {size:.3g} m at {at:.4g} s of demonstration {i}", i, name)
+        for i, (size, usual, at, step) in enumerate(leaps)
         if size > max(JUMP, JUMP_STEPS * usual, JUMP_SPEED * step)
-    }
-    if odd:
-        places = [
-            f"by {s:.3g} m at {at:.4g} s of demonstration {i}" for i, (s, at) in odd.items()
-        ]
-        message = f"frame {name!r} jumps {listed(places)}"
-        remedy = (
-            "Did the tracker lose it? Leave the episode out, or give one pose for all of it"
-        )
-        yield Finding("frames", message, remedy, (name,), tuple(odd))
+    ]
+    remedy = "Did the tracker lose it? Leave the episode out, or give one pose for all of it"
+    yield from found_at("frames", f"frame {name!r} jumps", remedy, places)
 
 
 def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:

@@ -1,0 +1,34 @@
+"""One finding about all places at which something was found."""
+
+from collections.abc import Iterator, Sequence
+from math import nan
+
+from tpgmm_torch.checks.report import Finding, listed
+
+__all__ = ["found_at"]
+
+
+def found_at(
+    check: str,
+    message: str,
+    remedy: str,
+    places: Sequence[tuple[str, int, str]],
+    value: float = nan,
+) -> Iterator[Finding]:
+    """The finding about some places, if there are any.
+
+    Parameters
+    ----------
+    check, message, remedy : str
+        As of :class:`~tpgmm_torch.checks.report.Finding`; the message goes on with the places.
+    places : sequence of (str, int, str)
+        What is said of each, its demonstration, and its joint or frame, empty if it has none.
+    value : float, optional
+        As of the finding.
+    """
+    if places:
+        texts, episodes, names = (
+            tuple(dict.fromkeys(part)) for part in zip(*places, strict=True)
+        )
+        about = tuple(filter(None, names))
+        yield Finding(check, f"{message} {listed(texts)}", remedy, about, episodes, value)
