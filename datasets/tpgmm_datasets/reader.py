@@ -103,11 +103,9 @@ class Recording:
             if lost:
                 policy(DatasetError("; ".join(summed_up(lost)), check="events"))
             if self.episodes and not read:
-                reasons = "; ".join(summed_up(policy.problems))
-                raise DatasetError(
-                    f"none of the {len(self.episodes)} episodes is left by the checks that "
-                    f"are relaxed, {sorted(self.relax)}: {reasons}"
-                )
+                lost_to = f"{sorted(self.relax)}: {'; '.join(summed_up(policy.problems))}"
+                count = f"none of the {len(self.episodes)} episodes is left"
+                raise DatasetError(f"{count} by the checks that are relaxed, {lost_to}")
             if check:
                 self._report(summaries).act(packages=(PACKAGE,))
         finally:
@@ -136,14 +134,11 @@ class Recording:
         robot, raw = self.assembly.robot, self.assembly.joints.raw
         known = robot if isinstance(robot, Kinematics) else None
         report = check_summaries(summaries, known, raw)
-        findings = [
-            replace(one, remedy=RAW)
-            if {*one.names} <= raw and one.check in ("units", "limits")
-            else one
-            for one in report
-        ]
-        doubtful = doubtful_events(self.assembly.doubtful, "episode")
-        return Report.of([*self.findings, *findings, *doubtful], report.subject)
+        findings = [*self.findings, *doubtful_events(self.assembly.doubtful, "episode")]
+        for one in report:
+            own = {*one.names} <= raw and one.check in ("units", "limits")
+            findings.append(replace(one, remedy=RAW) if own else one)
+        return Report.of(findings, report.subject)
 
 
 def open_recording(
@@ -189,12 +184,10 @@ def open_recording(
     pairs = zip(feature.names or (), columns.units, strict=False)
     unknown = [name for name, unit in pairs if unit == "auto"]
     if calibration is not None and unknown:
-        raise DatasetError(
-            f"the calibration has no motor for {unknown}: give their units, "
-            f"units={{{unknown[0]!r}: 'deg', ...}} (--units {unknown[0]}=deg); 'raw' for what "
-            "is no joint",
-            column=feature.key,
-        )
+        given = f"units={{{unknown[0]!r}: 'deg', ...}} (--units {unknown[0]}=deg)"
+        remedy = f"give their units, {given}; 'raw' for what is no joint"
+        message = f"the calibration has no motor for {unknown}: {remedy}"
+        raise DatasetError(message, column=feature.key)
     chosen = tuple(select_episodes(layout, episodes))
     sources = frame_sources(layout, frames, chosen)
     stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
@@ -213,17 +206,12 @@ def open_recording(
 
 
 def _calibrated(
-    feature: Feature,
-    calibration: Calibration,
-    names: tuple[str, ...] | None,
-    units: Units,
+    feature: Feature, calibration: Calibration, names: tuple[str, ...] | None, units: Units
 ) -> Units:
     """Units by name: those that are given, else those of the calibration."""
     if not isinstance(units, Mapping) and units != "auto":
-        raise DatasetError(
-            f"units={units!r} is for all values, and so is a calibration: give one of them, or "
-            "units by name"
-        )
+        both = "is for all values, and so is a calibration: give one of them, or units by name"
+        raise DatasetError(f"units={units!r} {both}")
     if names is None:
         message = "the metadata do not name the values: a calibration needs joint_names=[...]"
         raise DatasetError(message, column=feature.key)
@@ -257,10 +245,9 @@ def select_episodes(
         problem = f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
     else:
         wanted = sorted({int(index) for index in episodes})
-        chosen = [by_index[index] for index in wanted if index in by_index]
         missing = [index for index in wanted if index not in by_index]
         problem = f"there are no episodes {missing}; the set has {sorted(by_index)}"
-        chosen = [] if missing else chosen
+        chosen = [] if missing else [by_index[index] for index in wanted]
         if not wanted:
             return []
     if not chosen:

@@ -87,7 +87,7 @@ class Signals:
             if robot is None or name in robot.joint_names
         }
         for feature in (state, action):
-            if feature is not None and feature.key != source.key:
+            if feature and feature.key != source.key and feature.names and feature.units:
                 _check_units(feature, scales)
         places = {
             name: tuple(pose.select(name, environment))
@@ -123,14 +123,10 @@ def _plain(pose: FramePose) -> bool:
 
 def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
     """What else holds the joints declares the same units, if any."""
-    if not feature.names or not feature.units:
-        return
-    declared = dict(zip(feature.names, feature.units, strict=True))
-    for entry, joint in match_names(list(scales), feature.names, feature.key, REMEDY).items():
-        unit = declared[entry]
-        if unit != "raw" and as_scale(unit, feature.key) != scales[joint]:
-            raise DatasetError(
-                f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit: a policy "
-                "needs one for states and actions",
-                column=feature.key,
-            )
+    names, units = feature.names or (), feature.units or ()
+    matched = match_names(list(scales), names, feature.key, REMEDY)
+    for entry, unit in zip(names, units, strict=True):
+        joint = matched.get(entry)
+        if joint and unit != "raw" and as_scale(unit, feature.key) != scales[joint]:
+            message = f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit"
+            raise DatasetError(f"{message}: a policy needs one of both", column=feature.key)

@@ -138,9 +138,8 @@ def trajectories_to_frame(
         raise DataError("expected at least one trajectory, got none")
     situations: Sequence[Mapping[str, Frame]] = frames or [{}] * len(trajectories)
     if len(situations) != len(trajectories):
-        raise DataError(
-            f"there are {len(trajectories)} trajectories, and frames of {len(situations)}"
-        )
+        counts = f"{len(trajectories)} trajectories, and frames of {len(situations)}"
+        raise DataError(f"there are {counts}")
     parts = []
     for episode, (one, poses) in enumerate(zip(trajectories, situations, strict=True)):
         rows, columns = np.triu_indices(len(one.joint_names))
@@ -198,23 +197,16 @@ def demonstrations_from_frame(
     parts = [(0, table)] if whole else [*table.groupby(episode, sort=False)]
     parts = [(label, _in_seconds(part, time)) for label, part in parts]
     names = list(joints) if joints is not None else _joints(table, parts, time, episode)
+    called = None if names == [str(i) for i in range(len(names))] else tuple(names)
     made = []
     for label, part in parts:
         kept = part.dropna(axis="columns", how="all")
         try:
-            made.append(
-                Demonstration(
-                    torch.from_numpy(numbers(kept, [time])[:, 0]),
-                    torch.from_numpy(numbers(kept, names)),
-                    _poses(kept, {time, episode, *names}),
-                    None if names == [str(i) for i in range(len(names))] else tuple(names),
-                    {
-                        name.removeprefix(EVENT): _only(kept, name)
-                        for name in kept.columns
-                        if name.startswith(EVENT)
-                    },
-                )
+            at, values = map(
+                torch.from_numpy, (numbers(kept, [time])[:, 0], numbers(kept, names))
             )
+            poses, events = _poses(kept, {time, episode, *names}), _events(kept)
+            made.append(Demonstration(at, values, poses, called, events))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
     return made
@@ -330,19 +322,16 @@ def _columns(
     episode: int, motion: Demonstration | Trajectory, frames: Mapping[str, Frame]
 ) -> dict[str, Array]:
     """Episode, time, joints and frames."""
-    rows, joints = len(motion), as_array(motion.joints)
-    names = _joint_names(motion)
+    rows, names = len(motion), _joint_names(motion)
     columns = [(EPISODE, np.full(rows, episode)), ("time", as_array(motion.time))]
-    columns += zip(names, joints.T, strict=True)
+    columns += zip(names, as_array(motion.joints).T, strict=True)
     for name, frame in frames.items():
         pose = as_array(torch.cat((frame.position, frame.orientation), -1))
-        pose = np.broadcast_to(pose, (rows, len(POSE_PARTS)))
-        columns += [(f"{name}.{part}", pose[:, i]) for i, part in enumerate(POSE_PARTS)]
+        values = np.broadcast_to(pose, (rows, len(POSE_PARTS))).T
+        columns += zip([f"{name}.{part}" for part in POSE_PARTS], values, strict=True)
     if len({name for name, _ in columns}) < len(columns):
-        raise DataError(
-            f"joints {list(names)} and frames {sorted(frames)} have a column in common, or one "
-            "is called 'time' or 'episode': rename it"
-        )
+        common = "have a column in common, or one is called 'time' or 'episode': rename it"
+        raise DataError(f"joints {list(names)} and frames {sorted(frames)} {common}")
     return dict(columns)
 
 
@@ -387,9 +376,8 @@ def _checked(
         raise DataError("the table has no rows")
     if episode in table.columns and table[episode].isna().any():
         raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
-    empty = [
-        n for n in _others(table, {time, episode, *(joints or ())}) if table[n].isna().all()
-    ]
+    others = _others(table, {time, episode, *(joints or ())})
+    empty = [name for name in others if table[name].isna().all()]
     if told := [name for name in empty if not UNNAMED.fullmatch(name)]:
         _warn(f"columns {told} of the table are empty, and left out")
     return table.drop(columns=empty)
@@ -406,16 +394,13 @@ def _joints(
     in_poses = {rest[i] for group in pose_groups(rest).values() for i in group}
     names = [name for name in columns if name not in in_poses]
     if not names:
-        raise DataError(
-            f"the table has no joints: {columns} are poses of frames or something else. If "
-            "some are joints, say so: joints=[...]"
-        )
+        other = f"{columns} are poses of frames or something else"
+        raise DataError(f"the table has no joints: {other}. If some are, say so: joints=[...]")
     taken = [name for name in names if name not in known]
     for frame, missing in _incomplete_poses(taken).items():
         raise DataError(
             f"the table has a part of the pose of {frame!r}, and no columns {list(missing)}: "
-            "add them (1, 0, 0, 0 where no orientation was recorded), or say which columns are "
-            "joints: joints=[...]"
+            "add them (1, 0, 0, 0 where it is not known), or say which are joints: joints=[...]"
         )
     values = [name for name in taken if table[name].dtype.kind in "iuf"]
     counters = [name for name in values if COUNTS.fullmatch(name)]
@@ -423,16 +408,13 @@ def _joints(
     if counters := [*counters, *(n for n, kind in steady.items() if kind == "counter")]:
         raise DataError(
             f"columns {counters} count the rows or tell the time, and are no joints: drop them "
-            "(pandas leaves its own out of a file with index=False), or say which are: "
-            "joints=[...]"
+            "(pandas: to_csv(..., index=False)), or say which are: joints=[...]"
         )
     if unnamed := [name for name in taken if UNNAMED.fullmatch(name)]:
         raise DataError(f"columns {unnamed} have no name: name or drop them, or joints=[...]")
     if even := [name for name, kind in steady.items() if kind]:
-        _warn(
-            f"columns {even} change by the same in every row: are they joints (joints=[...]), "
-            "or do they count something? Then drop them"
-        )
+        asked = "are they joints (joints=[...]), or do they count something? Then drop them"
+        _warn(f"columns {even} change by the same in every row: {asked}")
     return names
 
 
@@ -464,10 +446,10 @@ def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
         dates = dates if kind == "m" else dates.apply(_pandas().to_datetime, **options)
         since = (dates - dates[time].iloc[0]).apply(lambda column: column.dt.total_seconds())
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        raise DataError(
-            f"column {time!r} holds neither numbers nor dates, its first value is {first!r}: "
-            "convert it to seconds"
-        ) from error
+        message = (
+            f"column {time!r} holds neither numbers nor dates, its first value is {first!r}"
+        )
+        raise DataError(f"{message}: convert it to seconds") from error
     return part.assign(**since)
 
 
@@ -498,12 +480,14 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
     return frames
 
 
-def _only(part: pd.DataFrame, name: str) -> float:
-    """The one value that an event's column repeats."""
-    values = numbers(part, [name])
-    if bool((values != values[0]).any()):
-        raise DataError(f"column {name!r} is one time [s], but it changes")
-    return float(values[0, 0])
+def _events(part: pd.DataFrame) -> dict[str, float]:
+    events = {}
+    for name in (name for name in part.columns if name.startswith(EVENT)):
+        values = numbers(part, [name])
+        if bool((values != values[0]).any()):
+            raise DataError(f"column {name!r} is one time [s], but it changes")
+        events[name.removeprefix(EVENT)] = float(values[0, 0])
+    return events
 
 
 def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
@@ -528,8 +512,7 @@ def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
         if values.dtype.kind not in "biuf":
             raise DataError(
                 f"column {name!r} holds no numbers, its first value is {values.iloc[0]!r}: "
-                "leave it out of the table, or out of joints=[...]; decimal commas are read by "
-                "pandas.read_csv(..., decimal=',')"
+                "leave it out (joints=[...]); decimal commas: pandas.read_csv(..., decimal=',')"
             )
         if values.isna().any():
             row = values.index[values.isna()][0]

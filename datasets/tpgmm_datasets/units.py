@@ -164,11 +164,12 @@ def convert(
         _check_angles(values, names, units, column, where)
     for i, (name, scale) in enumerate(zip(names, scales, strict=True)):
         low, high = scale.stored or (-math.inf, math.inf)
-        if values[:, i].min() < low - ROUNDING or values[:, i].max() > high + ROUNDING:
+        least, most = values[:, i].min(), values[:, i].max()
+        if least < low - ROUNDING or most > high + ROUNDING:
             message = (
-                f"{name!r} goes from {values[:, i].min():.4g} to {values[:, i].max():.4g}, but "
-                f"is to be normalised to {low:g} ... {high:g}: was it recorded in degrees "
-                "(use_degrees)? Then units='deg' (--units deg), without a calibration"
+                f"{name!r} goes from {least:.4g} to {most:.4g}, but is to be normalised to "
+                f"{low:g} ... {high:g}: was it recorded in degrees (use_degrees)? Then "
+                "units='deg' (--units deg), without a calibration"
             )
             raise DatasetError(message, column=column, **where)
     converted: Array = values.astype(np.float64)
@@ -199,15 +200,14 @@ def _check_angles(
         unsure += [f"{told[i]}: not either)" for i in auto if i not in large]
     if unsure:
         because = f", because {others[0]} and joints have one unit" if others else ""
-        raise UnknownUnitsError(
+        message = (
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
             "units='lerobot' (arms in degrees, grippers 0 to 100), 'deg' or units={'*': 'deg', "
             "'*gripper': 'raw', name: Scale.calibrated(...), ...} (commands: --units lerobot, "
             "deg, PATTERN=raw or LeRobot's calibration file; training: --policy.units); 'raw' "
-            "takes them as they are",
-            column=column,
-            **where,
+            "takes them as they are"
         )
+        raise UnknownUnitsError(message, column=column, **where)
 
 
 def as_scale(unit: Unit, column: str) -> Scale:
@@ -230,10 +230,8 @@ def as_scale(unit: Unit, column: str) -> Scale:
     if unit == "auto":
         return NAMED["raw"]
     if unit not in NAMED:
-        message = (
-            f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'lerobot', 'auto' and Scale"
-        )
-        raise DatasetError(message, column=column)
+        there = f"{sorted(NAMED)}, 'lerobot', 'auto' and Scale"
+        raise DatasetError(f"unit {unit!r} is unknown; there are {there}", column=column)
     return NAMED[unit]
 
 
@@ -294,9 +292,8 @@ def _lerobot(stored: str, name: str, robot: Any) -> Unit:
     if not is_gripper(stored) and not is_gripper(name):
         return "deg"
     limits = (getattr(robot, key, ()) for key in ("joint_names", "lower", "upper"))
-    low, high = {joint: (float(a), float(b)) for joint, a, b in zip(*limits, strict=False)}.get(
-        name, (0, math.inf)
-    )
+    ranges = {joint: (float(a), float(b)) for joint, a, b in zip(*limits, strict=False)}
+    low, high = ranges.get(name, (0, math.inf))
     if math.isinf(high - low):
         return "raw"
     return replace(Scale.between((0, 100), (low, high)), stored=(0.0, 100.0))

@@ -43,18 +43,13 @@ def frame_sources(
     DatasetError
         If a source is none, or has not one pose for each of these episodes.
     """
-    if frames is not None:
-        wanted = [episode.index for episode in chosen]
-        known = {episode.index for episode in layout.episodes}
-        return {
-            name: _frame_source(layout, name, source, wanted, known)
-            for name, source in frames.items()
-        }
-    feature = layout.features.get(ENVIRONMENT)
-    groups = pose_groups(feature.names) if feature else {}
-    return {
-        name: FramePose(ENVIRONMENT, columns, constant=None) for name, columns in groups.items()
-    }
+    if frames is None:
+        feature = layout.features.get(ENVIRONMENT)
+        groups = pose_groups(feature.names) if feature else {}
+        return {n: FramePose(ENVIRONMENT, group, constant=None) for n, group in groups.items()}
+    wanted = [episode.index for episode in chosen]
+    known = {episode.index for episode in layout.episodes}
+    return {n: _frame_source(layout, n, one, wanted, known) for n, one in frames.items()}
 
 
 def _frame_source(
@@ -67,9 +62,8 @@ def _frame_source(
         if path.suffix in (".csv", ".parquet") or path.is_file():
             return MeasuredPoses.read(name, path, wanted, known)
         return LinkPose.parse(text) if "@" in text else FramePose(text)
-    return (
-        source if isinstance(source, Pose) else MeasuredPoses.given(name, source, wanted, known)
-    )
+    given = isinstance(source, Pose)
+    return source if given else MeasuredPoses.given(name, source, wanted, known)
 
 
 def event_sources(
@@ -107,21 +101,18 @@ def event_sources(
     for name, pose in frames.items():
         if not isinstance(pose, LinkPose) or not isinstance(pose.event, str):
             continue
-        if pose.event in sources or pose.event in stored:
+        where, event = f"frame {name!r}", pose.event
+        if event in sources or event in stored:
             continue
         try:
-            detector = usual_event(pose.event, pose.link, names or ())
+            detector = usual_event(event, pose.link, names or ())
         except DataError as error:
+            message = f"{where}: event {event!r} is not in the data set, and {error}"
+            raise DatasetError(message) from error
+        if detector is not None and usual.setdefault(event, detector) != detector:
             raise DatasetError(
-                f"frame {name!r}: event {pose.event!r} is not in the data set, and {error}"
-            ) from error
-        if detector is None:
-            continue
-        if usual.setdefault(pose.event, detector) != detector:
-            raise DatasetError(
-                f"frame {name!r}: {pose.event!r} of {pose.link!r} is another event than "
-                f"{pose.event!r} of the other links; call it otherwise, as in "
-                f"events={{'{pose.event}_{pose.link}': 'closing:SIGNAL'}}"
+                f"{where}: {event!r} of {pose.link!r} is another event than of the other "
+                f"links; call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
             )
     return sources | usual
 
@@ -191,10 +182,9 @@ class Assembly:
     @property
     def features(self) -> list[Feature]:
         """What has to be read."""
-        sources = self.frames.values()
-        keys = [source.feature for source in sources if isinstance(source, FramePose)]
-        poses = map(self.layout.feature, dict.fromkeys(keys))
-        return [self.joints.feature, *poses, *event_features(self.layout)]
+        poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
+        objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
+        return [self.joints.feature, *objects, *event_features(self.layout)]
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
@@ -228,11 +218,9 @@ class Assembly:
             else:
                 at = float(source(demonstration))
             if not 0 <= at <= demonstration.duration:
-                raise DatasetError(
-                    f"event {name!r} was found at {at:.6g} s, outside the episode of "
-                    f"{demonstration.duration:.6g} s",
-                    **rows.episode.where,
-                )
+                whole = f"outside the episode of {demonstration.duration:.6g} s"
+                message = f"event {name!r} was found at {at:.6g} s, {whole}"
+                raise DatasetError(message, **rows.episode.where)
             events[name] = at
         return replace(demonstration, events=events) if self.events else demonstration
 

@@ -87,8 +87,7 @@ class FramePose:
     def __post_init__(self) -> None:
         if self.rotation not in ROTATIONS:
             raise DatasetError(
-                f"rotation {self.rotation!r} is unknown; there are "
-                f"{[name for name in ROTATIONS if name]} and None"
+                f"rotation {self.rotation!r} is unknown; there are {[*ROTATIONS]}"
             )
 
     def select(self, name: str, feature: Feature) -> list[int]:
@@ -101,20 +100,19 @@ class FramePose:
             places = [self._place(column, feature) for column in self.columns]
         elif self.rotation == "wxyz" and (stored := pose_groups(feature.names)):
             if name not in stored:
-                raise DatasetError(
-                    f"frame {name!r} is not stored there, {sorted(stored)} are. To take one of "
-                    "them by another name, give FramePose(..., columns=[...]) (--frame "
-                    "NAME=FEATURE[7:14])",
-                    column=self.feature,
+                message = (
+                    f"frame {name!r} is not stored there, {sorted(stored)} are. For another "
+                    "name, FramePose(..., columns=[...]) (--frame NAME=FEATURE[7:14])"
                 )
+                raise DatasetError(message, column=self.feature)
             places = list(stored[name])
         if len(places) != needed:
-            raise DatasetError(
+            message = (
                 f"frame {name!r} needs {needed} values (position, rotation as "
                 f"{self.rotation!r}), the selection has {len(places)} of the feature's "
-                f"{feature.width}, called {feature.names}. Give FramePose(..., columns=[...])",
-                column=self.feature,
+                f"{feature.width}, called {feature.names}. Give FramePose(..., columns=[...])"
             )
+            raise DatasetError(message, column=self.feature)
         return places
 
     def _place(self, column: int | str, feature: Feature) -> int:
@@ -123,10 +121,8 @@ class FramePose:
             return names.index(column)
         if isinstance(column, int) and -feature.width <= column < feature.width:
             return column % feature.width
-        raise DatasetError(
-            f"there is no value {column!r} among its {feature.width}, called {feature.names}",
-            column=self.feature,
-        )
+        among = f"its {feature.width}, called {feature.names}"
+        raise DatasetError(f"there is no value {column!r} among {among}", column=self.feature)
 
     def frame(self, values: Array, places: list[int], **where: Any) -> Frame:
         """The frame of the values at ``places`` of a feature's (T, width).
@@ -136,8 +132,7 @@ class FramePose:
         DatasetError
             If a quaternion is not of unit norm.
         """
-        rows = values if not self.constant else values[:1]
-        rows = rows[:, places].astype(np.float64)
+        rows = values[: 1 if self.constant else None, places].astype(np.float64)
         still = self.constant or (self.constant is None and bool((rows == rows[:1]).all()))
         tensor = torch.from_numpy(rows[0] if still else rows)
         position, rotation = tensor[..., :3] * self.scale, tensor[..., 3:]
@@ -145,8 +140,8 @@ class FramePose:
             off = (torch.linalg.vector_norm(rotation, dim=-1) - 1).abs().max()
             if off > 2 * quaternions.DIGITS:
                 message = (
-                    f"the norm of a quaternion is off by {float(off):.3g}; are the columns "
-                    f"and their order right? The rotation is read as {self.rotation!r}"
+                    f"the norm of a quaternion is off by {float(off):.3g}, read as "
+                    f"{self.rotation!r}: are the columns and their order right?"
                 )
                 raise DatasetError(message, check="poses", column=self.feature, **where)
         return Frame(position, self._orientation(rotation))
@@ -220,10 +215,8 @@ class MeasuredPoses:
                 raise DataError("the table has no rows")
             episodes = numbers(table, [used.pop("episode")[0]])[:, 0]
             if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
-                raise DataError(
-                    f"rows are for episodes {listed(strange)}, the set has {min(known)} to "
-                    f"{max(known)}, as 'tpgmm dataset info' counts"
-                )
+                there = f"{min(known)} to {max(known)}, as 'tpgmm dataset info' counts"
+                raise DataError(f"rows are for episodes {listed(strange)}, the set has {there}")
             time = used.pop("time", ("", 1.0))[0]
             columns, factors = zip(*used.values(), strict=True)
             pose = FramePose(" ".join(columns), None, WRITTEN[" ".join(used)], None)
@@ -260,9 +253,8 @@ class MeasuredPoses:
             If there are others, or more or less of them.
         """
         given = frames if isinstance(frames, Mapping | Sequence) else ()
-        several = dict(
-            given if isinstance(given, Mapping) else zip(wanted, given, strict=False)
-        )
+        by_index = isinstance(given, Mapping)
+        several = dict(given if by_index else zip(wanted, given, strict=False))
         fits = len(several) == len(given) and {*wanted} <= {*several} <= {*known}
         if not fits or not all(isinstance(frame, Frame) for frame in several.values()):
             kinds = {type(frame).__name__ for frame in several.values()}
@@ -286,18 +278,16 @@ class MeasuredPoses:
         if measured is not None:
             begin, end, length = float(measured[0]), float(measured[-1]), float(time[-1])
             if end <= 0 or begin > length or end - begin > LONGEST * length:
-                raise DatasetError(
-                    f"frame {name!r} was measured from {begin:.6g} to {end:.6g}, the episode "
-                    f"takes {length:.4g} s: times in {self.feature} are in seconds, from the "
-                    "start of each episode",
-                    **where,
+                message = (
+                    f"frame {name!r} was measured from {begin:.6g} to {end:.6g}, the "
+                    f"episode takes {length:.4g} s: times in {self.feature} are in seconds, "
+                    "from the start of each"
                 )
+                raise DatasetError(message, **where)
             pose = pose.resampled(measured, torch.from_numpy(time))
         if pose.batch_shape not in ((), (len(time),)):
-            raise DatasetError(
-                f"frame {name!r} has {len(pose.position)} poses, the episode {len(time)} steps",
-                **where,
-            )
+            counts = f"{len(pose.position)} poses, the episode {len(time)} steps"
+            raise DatasetError(f"frame {name!r} has {counts}", **where)
         return pose
 
 
@@ -316,11 +306,11 @@ def _pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str, flo
             found[part] = column, UNITS.get(unit, 1.0)
     ordered = [p for p in WRITTEN if {*p.split(), "episode"} == {*found} - {"time"}]
     if wrong or not ordered:
+        strange = f", and {wrong} are unknown or there twice" if wrong else ""
         raise DataError(
-            f"the table has columns {list(columns)}"
-            + f", and {wrong} are unknown or there twice" * bool(wrong)
-            + f". Name them episode, x, y, z (or {name}.x, ...), and yaw, or qw, qx, qy, qz; "
-            "time if it moves; x_mm or yaw_deg in other units. Leave others out"
+            f"the table has columns {list(columns)}{strange}. Name them episode, x, y, z (or "
+            f"{name}.x, ...), and yaw, or qw, qx, qy, qz; time if it moves; x_mm or yaw_deg in "
+            "other units. Leave others out"
         )
     parts = ("episode", "time", *ordered[0].split())
     return {part: found[part] for part in parts if part in found}

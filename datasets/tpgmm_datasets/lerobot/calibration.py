@@ -67,10 +67,8 @@ def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[s
     motors: dict[str, Scale] = {}
     for prefix, file in files.items():
         if not isinstance(file, str | Path):
-            raise DatasetError(
-                f"a calibration is the path of LeRobot's JSON file, or several by prefix; got "
-                f"{calibration!r}"
-            )
+            wanted = "the path of LeRobot's JSON file, or several by prefix"
+            raise DatasetError(f"a calibration is {wanted}; got {calibration!r}")
         motors |= {f"{prefix}{name}": _scale(name, motor, file) for name, motor in _read(file)}
     matched = match_names(list(motors), names, "calibration", REMEDY, "the motor")
     return {value: motors[name] for value, name in matched.items()}
@@ -90,18 +88,18 @@ def _scale(name: str, motor: Any, file: str | Path) -> Scale:
     fields = [motor.get(field) for field in FIELDS] if isinstance(motor, dict) else []
     whole = [value for value in fields if type(value) is int]
     if len(whole) < len(FIELDS) or whole[1] >= whole[2]:
-        raise DatasetError(
-            f"motor {name!r} needs whole numbers {list(FIELDS)} and a range, got {motor!r}",
-            file=file,
+        message = (
+            f"motor {name!r} needs whole numbers {list(FIELDS)} and a range, got {motor!r}"
         )
+        raise DatasetError(message, file=file)
     drive_mode, low, high = whole
     stored = (0.0, 100.0) if "gripper" in name else (-100.0, 100.0)
     if drive_mode:
-        raise DatasetError(
+        message = (
             f"motor {name!r} has the drive mode {drive_mode}. Whether LeRobot turned it round "
             f"depends on its bus: say units={{{name!r}: Scale.calibrated({low}, {high}, "
             f"stored={stored})}} for Dynamixel, stored={stored[::-1]} for Feetech, and leave "
-            "the motor out of the file",
-            file=file,
+            "the motor out of the file"
         )
+        raise DatasetError(message, file=file)
     return Scale.calibrated(low, high, stored=stored)

@@ -66,10 +66,8 @@ class Relaxed:
         self.names = {relax} if isinstance(relax, str) else set(relax)
         self.problems: list[DatasetError] = []
         if not self.names <= set(CHECKS):
-            raise DatasetError(
-                f"relax names {sorted(self.names - set(CHECKS))}; the checks are "
-                f"{sorted(CHECKS)}"
-            )
+            unknown = sorted(self.names - set(CHECKS))
+            raise DatasetError(f"relax names {unknown}; the checks are {sorted(CHECKS)}")
 
     def __call__(self, problem: DatasetError) -> None:
         """Raise a problem, or keep it."""
@@ -95,21 +93,17 @@ def read_episodes(
     groups: dict[Path, list[Episode]] = {}
     for episode in wanted:
         groups.setdefault(episode.file, []).append(episode)
-    for file, episodes in groups.items():
+    for episodes in groups.values():
         try:
-            yield from _read_file(layout, file, episodes, features, policy)
+            yield from _read_file(layout, episodes, features, policy)
         except DatasetError as problem:
             policy(problem)
 
 
 def _read_file(
-    layout: Layout,
-    file: Path,
-    episodes: Sequence[Episode],
-    features: Sequence[Feature],
-    policy: Policy,
+    layout: Layout, episodes: Sequence[Episode], features: Sequence[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
-    keys = [feature.key for feature in features]
+    file, keys = episodes[0].file, [feature.key for feature in features]
     expected = {episode.index: episode for episode in episodes}
     listed = {one.index: one.length for one in layout.episodes if one.file == file}
     seen: set[int] = set()
@@ -123,9 +117,9 @@ def _read_file(
         rows, longest = parquet.metadata.num_rows, max(listed.values())
         if (longest + max(rows - sum(listed.values()), 0)) * values > MOST_IN_EPISODE:
             message = (
-                f"it has {rows} rows of {values} values, for episodes of at most {longest}; of "
-                f"one at most {MOST_IN_EPISODE} values are read"
+                f"it has {rows} rows of {values} values, for episodes of at most {longest}"
             )
+            message += f"; of one at most {MOST_IN_EPISODE} values are read"
             raise DatasetError(message, check="metadata", file=file)
         columns = list(dict.fromkeys([*counters, *keys]))
         for index, table in episode_tables(parquet, file, columns):
@@ -133,9 +127,7 @@ def _read_file(
                 message = "its rows are there twice, or are not together"
                 policy(DatasetError(message, check="duplicates", file=file, episode=index))
             elif index in expected:
-                rows = _rows(layout, expected[index], table, features, policy)
-                if rows is not None:
-                    yield rows
+                yield from _rows(layout, expected[index], table, features, policy)
             elif index not in listed:
                 message = "the metadata do not list it in this file"
                 policy(DatasetError(message, check="metadata", file=file, episode=index))
@@ -155,13 +147,10 @@ def _declaration_problems(
         declared = json.loads(metadata[METADATA_KEY])
         pairs = [("fps", declared["fps"], layout.info.get("fps"))]
         present = layout.info["features"]
-        pairs += [
-            (key, declared["features"][key], present.get(key)) for key in declared["features"]
-        ]
+        pairs += [(key, one, present.get(key)) for key, one in declared["features"].items()]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(
-            f"the description in the file is corrupted: {error!r}", check="missing", file=file
-        ) from error
+        message = f"the description in the file is corrupted: {error!r}"
+        raise DatasetError(message, check="missing", file=file) from error
     for name, there, here in pairs:
         if there != here:
             message = f"the file was written with {there!r}, but info.json says {here!r}"
@@ -174,8 +163,8 @@ def _rows(
     table: pa.Table,
     features: Sequence[Feature],
     policy: Policy,
-) -> EpisodeRows | None:
-    """The checked arrays of an episode; None if it has a problem that the policy lets pass."""
+) -> Iterator[EpisodeRows]:
+    """The checked arrays of an episode; nothing if it has a problem that the policy lets pass."""
     problems = list(_row_problems(layout, episode, table))
     values = {}
     for feature in features:
@@ -185,10 +174,9 @@ def _rows(
             problems.append(error)
     for problem in problems:
         policy(problem)
-    if problems:
-        return None
-    stamps = table["timestamp"].to_numpy() if "timestamp" in table.column_names else None
-    return EpisodeRows(episode, row_times(stamps, len(table), layout.fps), values)
+    if not problems:
+        stamps = table["timestamp"].to_numpy() if "timestamp" in table.column_names else None
+        yield EpisodeRows(episode, row_times(stamps, len(table), layout.fps), values)
 
 
 def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:

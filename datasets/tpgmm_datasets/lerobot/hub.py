@@ -60,17 +60,14 @@ def _fetch(repo_id: str) -> Path:
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
-        raise DependencyError(
-            f"to fetch the data set {repo_id!r} from the Hugging Face hub, pip install "
-            "huggingface_hub"
-        ) from error
+        fetched = f"to fetch the data set {repo_id!r} from the Hugging Face hub"
+        raise DependencyError(f"{fetched}, pip install huggingface_hub") from error
     # its errors are many classes: offline, not found, no access, no connection
     try:
         return Path(snapshot_download(repo_id, repo_type="dataset", allow_patterns=PATTERNS))
     except Exception as error:
         raise DatasetError(
-            f"the data set {repo_id!r} is neither in the local Hugging Face cache nor in "
-            f"reach ({type(error).__name__}). Where there is "
-            f"a connection: hf download --repo-type dataset {repo_id} --include 'meta/*' "
-            "'data/*'; then copy the cache, or pass the folder"
+            f"the data set {repo_id!r} is neither in the local Hugging Face cache nor in reach "
+            f"({type(error).__name__}). Where there is a connection: hf download --repo-type "
+            f"dataset {repo_id} --include 'meta/*' 'data/*'; then copy its cache"
         ) from error

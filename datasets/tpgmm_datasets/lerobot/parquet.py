@@ -42,10 +42,8 @@ def _named(file: Path) -> Iterator[None]:
         if isinstance(error, DatasetError):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        message = (
-            "this is not a complete parquet file: it is corrupted, truncated, or the set "
-            f"was never finalised ({reason})"
-        )
+        cause = "it is corrupted, truncated, or the set was never finalised"
+        message = f"this is not a complete parquet file: {cause} ({reason})"
         raise DatasetError(message, check="missing", file=file) from error
 
 
@@ -63,19 +61,19 @@ def open_parquet(
     try:
         with open_whole(path):
             pass
-    except FileNotFoundError as error:
-        raise DatasetError("the file is missing", check="missing", file=file) from error
     except (OSError, ValueError) as error:
-        raise DatasetError(str(error), check="missing", file=file) from error
+        absent = isinstance(error, FileNotFoundError)
+        message = "the file is missing" if absent else str(error)
+        raise DatasetError(message, check="missing", file=file) from error
     with _named(file):
         # buffering ahead would hold the whole file
         parquet = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         present = parquet.schema_arrow.names
     for column in (*columns, *(name for name in optional if name in present)):
         if present.count(column) != 1:
+            there = [name for name in present if not name.startswith("stats/")]
             message = (
-                f"the file has {present.count(column)} columns of that name; it has "
-                f"{[name for name in present if not name.startswith('stats/')]}"
+                f"the file has {present.count(column)} columns of that name; it has {there}"
             )
             raise DatasetError(message, file=file, column=column)
     return parquet
