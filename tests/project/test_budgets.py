@@ -56,7 +56,7 @@ CEILINGS = {
     "lines of environments and evaluation": 8950,
     "lines of tests of core, data sets, policy and tools": 19310,
     "longest function of the core": 81,
-    "named numeric constants of the core": 115,
+    "named numeric constants of the core": 117,
 }
 
 

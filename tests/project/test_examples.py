@@ -157,7 +157,7 @@ CLAIMS = {
             and np.median(v["found"]["the tip first"][-1, :, 1]) > 90
             and v["found"]["compromise"][:3, :, :2].max() < 5
             and np.median(v["found"]["compromise"][-1, :, 0]) > 50
-            and v["found"]["the tip first"][:3, :, 0].max() > 5
+            and 0 < (v["found"]["the tip first"][..., 0] > 20).sum() < 6
             and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
         ),
     ),

@@ -714,7 +714,7 @@ MEASURED = (
         ["0,0,0,0,0,0"],
         r"\['yaw_deg'\] are unknown or there twice",
     ),
-    ("semicolons", "episode;x;y;z", ["0;0;0;0"], r"are unknown"),
+    ("semicolons", "episode;x;y;z;up", ["0;0;0;0;1"], r"\['up'\] are unknown"),
     ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"\['score'\] are unknown"),
     ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"'mug.z'\]. Name them .*cup.x"),
     ("millimetres", STILL, ["0,300,100,0", *ONES[1:]], r"episode 0: .*316.2 m away.*x_mm"),

@@ -28,6 +28,8 @@ __all__ = ["step_within", "within"]
 
 #: Added to unit variances before they are inverted: rounding may have made them singular.
 JITTER = 1e-12
+#: What the solver says of a minimum, and of a precision that is not positive.
+FOUND, NOT_CONVEX = 1, -5
 
 
 def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
@@ -103,21 +105,23 @@ def step_within(
     DataError
         If a precision is singular.
     """
-    unit = precision.diagonal(dim1=-2, dim2=-1).rsqrt()
-    scaled = precision * unit.unsqueeze(-1) * unit.unsqueeze(-2)
     lower = torch.minimum(lower, upper)
-    low, high = (lower - joints) / unit, (upper - joints) / unit
-    steps, _ = _solved(scaled, vector * unit, low, high)
-    there = joints + unit * torch.from_numpy(steps).to(joints)
-    return torch.clamp(there, lower, upper)
+    steps, _ = _solved(precision, vector, lower - joints, upper - joints)
+    return torch.clamp(joints + torch.from_numpy(steps).to(joints), lower, upper)
 
 
 def _solved(
     precision: Tensor, vector: Tensor, low: Tensor, high: Tensor
 ) -> tuple[Array, Array]:
-    """The minimum of ``x^T precision x / 2 - vector^T x`` within bounds, and multipliers."""
+    """The minimum of ``x^T precision x / 2 - vector^T x`` within bounds, and multipliers.
+
+    Of unit precisions alone the solver finds it where the joints are far from equally stiff.
+    """
     shape = vector.shape
-    numbers = (precision, vector, low.expand(shape), high.expand(shape))
+    unit = precision.diagonal(dim1=-2, dim2=-1).rsqrt()
+    precision = precision * unit.unsqueeze(-1) * unit.unsqueeze(-2)
+    low, high = low.expand(shape) / unit, high.expand(shape) / unit
+    numbers = (precision, vector * unit, low, high)
     h, f, least, most = (
         np.ascontiguousarray(x.numpy(force=True), dtype=np.float64) for x in numbers
     )
@@ -128,7 +132,10 @@ def _solved(
     for row in np.ndindex(*shape[:-1]):
         problem = h[row], -f[row], none, most[row], least[row]
         x, _, flag, info = daqp.solve(*problem, primal_tol=1e-11)
-        if flag != 1:
+        if flag not in (FOUND, NOT_CONVEX):  # rounding hides which directions are soft
+            stiffer = h[row] + 1e3 * JITTER * np.eye(shape[-1])
+            x, _, flag, info = daqp.solve(stiffer, *problem[1:], primal_tol=1e-11)
+        if flag != FOUND:
             raise DataError("the product is not positive definite: a larger reg_covar helps")
         solution[row], multipliers[row] = x, info["lam"]
-    return solution, multipliers
+    return solution * unit.numpy(force=True), multipliers

@@ -313,6 +313,7 @@ class Robot(Described):
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
             limits, self.without_limits = _limits(model, self.joint_names, column)
+            self.doubtful = tuple(n for n in self.without_limits if model.joint[n].doubts)
             self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
                 **options
             )
@@ -640,13 +641,7 @@ def _limit_leader(
     Limits that leave it a single point, as where a sign was forgotten, are none: the answer
     is False.
     """
-    try:
-        leader = model.leader(joint.name)
-    except (
-        DataError,
-        UnknownNameError,
-    ):  # raised where it matters: for a link that depends on it
-        return True
+    leader = model.leader(joint.name)
     if leader.joint not in own or leader.multiplier == 0:
         return True
     row, factor = rows[leader.joint], leader.multiplier

@@ -38,7 +38,7 @@ SAME_PATH, SMALLEST_RANGE = 0.5, 0.2
 #: Fewer recordings do not show what a usual path is.
 FEWEST_PATHS, FEWEST_REVERSED = 5, 3
 #: A path runs backwards if, turned around, its steps go so much along those of the median path
-#: (cosine), and by so much more than as it was recorded.
+#: (cosine), by so much more than as it was recorded; where most paths go along it.
 ALONG, BACKWARDS = 0.4, 0.2
 BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
 
@@ -196,7 +196,8 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
     along, turned = (
         _cosines(np.diff(p, axis=1), np.diff(median, axis=0)) for p in (paths, paths[:, ::-1])
     )
-    reverse = np.flatnonzero(turned > np.maximum(ALONG, along + BACKWARDS)).tolist()
+    against = (turned > np.maximum(ALONG, along + BACKWARDS)) & (np.median(along) > ALONG)
+    reverse = np.flatnonzero(against).tolist()
     places = [
         (f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})", i, "") for i in reverse
     ]

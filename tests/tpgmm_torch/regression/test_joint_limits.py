@@ -103,6 +103,21 @@ def test_single_precision_finds_it_too():
     assert_close(rough.double(), exact, 1e-3)
 
 
+def test_a_hand_that_goes_first_by_far_is_no_obstacle():
+    """Wanted far outside of the limits, as by a stretched arm; the solver cycles there."""
+    generator = torch.Generator().manual_seed(0)
+    random = partial(torch.randn, generator=generator, dtype=torch.float64)
+    jacobian = random(100, 1, 4) + 1e-2 * random(100, 2, 4)
+    precision = 1e11 * jacobian.mT @ jacobian + 0.3 * torch.eye(4)
+    joints = 100 * random(100, 4).sign()
+    lower, upper = joints - 5 * random(100, 4).abs(), joints + 5 * random(100, 4).abs()
+    downhill = -(precision @ joints.unsqueeze(-1))[..., 0]
+    there = step_within(joints, downhill, precision, lower, upper)
+    before, after = ((q.unsqueeze(-2) @ precision @ q.unsqueeze(-1)) for q in (joints, there))
+    assert bool((after <= before).all())
+    assert float((after / before).median()) < 0.99
+
+
 def test_inside_its_bounds_a_step_is_what_it_was():
     problem = Problem.of(CASES["the paper's"], 3, 2)
     now = times(2), problem.state, problem.frames
