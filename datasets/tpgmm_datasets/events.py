@@ -210,9 +210,8 @@ class ObjectMoves(Detector):
         """See :meth:`Detector.find`."""
         time, frame = _time(demonstration), demonstration.frame(self.frame)
         if not frame.batch_shape:
-            raise DataError(
-                f"frame {self.frame!r} was recorded once: when it starts to move is not known"
-            )
+            once = "was recorded once: when it starts to move is not known"
+            raise DataError(f"frame {self.frame!r} {once}")
         return Detection(*move_start(as_array(frame.position), time))
 
 
@@ -365,9 +364,8 @@ def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str,
     columns = sorted(i for group in gripper_groups(names).values() for i in group)
     found = [names[i] for i in columns]
     if side := sides & {*words(link or "")}:
-        found = [name for name in found if side & {*words(name)}] or [
-            name for name in found if not sides & {*words(name)}
-        ]
+        own = [name for name in found if side & {*words(name)}]
+        found = own or [name for name in found if not sides & {*words(name)}]
     if not found or {word for name in found for word in words(name)} >= sides:
         problem = f"{found} are of both hands" if found else "no signal is called a gripper's"
         raise DataError(

@@ -54,10 +54,10 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
     path = Path(path)
     try:
         items = json.loads(read_whole(path))
-    except FileNotFoundError:
-        raise DataError(f"there is no file {path}") from None
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error}") from error
+        absent = isinstance(error, FileNotFoundError)
+        message = f"there is no file {path}" if absent else f"{path} cannot be read: {error}"
+        raise DataError(message) from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not JSON: {error}") from error
     if not isinstance(items, list) or not items:
@@ -87,10 +87,8 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
                 raise UnknownNameError("joint", name, "the model", joint_names)
     situation = Situation(joints, poses, **times).reordered(joint_names)
     if len(situation.joints) != len(joint_names):
-        raise ShapeError(
-            f"'joints' has {len(situation.joints)} values, the model has {len(joint_names)} "
-            f"joints: {list(joint_names)}"
-        )
+        wanted = f"the model has {len(joint_names)} joints: {list(joint_names)}"
+        raise ShapeError(f"'joints' has {len(situation.joints)} values, {wanted}")
     return situation
 
 

@@ -8,6 +8,8 @@ import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import reduce
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -138,9 +140,8 @@ def save_lerobot(
     }
     with replacing(path, keep=True) as new:  # the files of old episodes stay as they are
         if path.exists() and not append:
-            raise DatasetError(
-                f"{path} exists; remove it, or pass append=True to add episodes to that set"
-            )
+            remedy = "remove it, or pass append=True to add episodes to that set"
+            raise DatasetError(f"{path} exists; {remedy}")
         # what another process has appended by now is there, and no third can come between
         old = open_layout(path) if path.exists() else None
         info = declared if old is None else _extended(old, declared)
@@ -200,27 +201,25 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
             raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
         hidden = shutil.ignore_patterns(".*")
         shutil.copytree(path, new, ignore=hidden, copy_function=_link_videos)
-        found, whole = dict[int, dict[str, Any]](), dict[str, Any]()
-        for file in dict.fromkeys(episode.file for episode in layout.episodes):
-            wanted = [episode for episode in layout.episodes if episode.file == file]
+        found = dict[int, Statistics]()
+        read = read_episodes(layout, layout.episodes, [old] if old else [], Relaxed(()))
+        for file, episodes in groupby(read, key=lambda rows: rows.episode.file):
             parts = []
-            for rows in read_episodes(layout, wanted, [old] if old else [], Relaxed(())):
+            for rows in episodes:
                 values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
                 poses = stored_frames(layout, sources, rows)
                 column = frame_columns(values, poses, declared, rows.episode.index)
                 parts.append(feature_table(column, declared))
-                statistics = episode_statistics(column)
-                whole = merge_statistics(whole, statistics) if whole else statistics
-                found[rows.episode.index] = statistics[ENVIRONMENT]
-            column = pa.concat_tables(parts)[ENVIRONMENT]
-            _rewrite(path, new, file, {ENVIRONMENT: column})
+                found[rows.episode.index] = episode_statistics(column)
+            _rewrite(path, new, file, {ENVIRONMENT: pa.concat_tables(parts)[ENVIRONMENT]})
+        whole = reduce(merge_statistics, found.values())
         for listed in (path / "meta" / "episodes").glob("*/*.parquet"):
             file = listed.relative_to(path)
             index = read_columns(listed, path, ["episode_index"])["episode_index"].to_pylist()
             columns = {}
             for name in whole[ENVIRONMENT]:
                 key = f"stats/{ENVIRONMENT}/{name}"
-                listing = [found[number][name].tolist() for number in index]
+                listing = [found[number][ENVIRONMENT][name].tolist() for number in index]
                 columns[key] = pa.array(listing, _episode_type(key))
             _rewrite(path, new, file, columns)
         meta = new / "meta"

@@ -47,9 +47,8 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     steps = int(float(source[-1]) * rate + 1e-6) + 1
     target = torch.arange(steps, dtype=source.dtype) / rate
     if len(source) == 1:
-        return replace(
-            demonstration, time=target, events=dict.fromkeys(demonstration.events, 0.0)
-        )
+        events = dict.fromkeys(demonstration.events, 0.0)
+        return replace(demonstration, time=target, events=events)
     right = torch.searchsorted(source, target).clamp(1, len(source) - 1)
     width = source[right] - source[right - 1]
     fraction = ((target - source[right - 1]) / width).clamp(0, 1)
@@ -101,9 +100,8 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     moving = torch.nonzero(speeds > speed).flatten()
     if not len(moving):
         fastest = float(speeds.max()) if len(speeds) else 0.0
-        raise DatasetError(
-            f"nothing moves faster than trim = {speed:g}; the fastest is {fastest:.3g}", **where
-        )
+        message = f"nothing moves faster than trim = {speed:g}; the fastest is {fastest:.3g}"
+        raise DatasetError(message, **where)
     events = [int((time - at).abs().argmin()) for at in demonstration.events.values()]
     start = min([int(moving[0]), *events])
     stop = max([int(moving[-1]) + 1, *events]) + 1

@@ -68,10 +68,10 @@ def features_of(
     given = dict(units or {})
     for name, unit in given.items():
         if name not in (names or ()) or unit not in JOINT_UNITS:
-            raise DatasetError(
-                f"units gives {name!r} the unit {unit!r}; the joints are {names}, "
-                f"their units in demonstrations {list(JOINT_UNITS)}"
+            wanted = (
+                f"the joints are {names}, their units in demonstrations {list(JOINT_UNITS)}"
             )
+            raise DatasetError(f"units gives {name!r} the unit {unit!r}; {wanted}")
     listed = [given.get(name, "rad") for name in names or [""] * first.n_joints]
     joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
     features = {STATE: joints}
@@ -164,10 +164,8 @@ def action_column(
     """The column ``action`` where the references are known, as the joints of ``commanded``."""
     feature = features[ACTION]
     if commanded.n_joints != feature["shape"][0]:
-        raise DatasetError(
-            f"demonstration {number} has {feature['shape'][0]} joints and actions of "
-            f"{commanded.n_joints} values"
-        )
+        counts = f"{feature['shape'][0]} joints and actions of {commanded.n_joints} values"
+        raise DatasetError(f"demonstration {number} has {counts}")
     return {ACTION: _cast(as_array(commanded.joints), feature["dtype"], ACTION, number)}
 
 
@@ -209,10 +207,7 @@ def feature_table(columns: Mapping[str, Array], features: Mapping[str, Any]) -> 
     for key, feature in features.items():
         values = np.ascontiguousarray(columns[key]).reshape(-1)
         width = feature["shape"][0]
-        flat = pa.array(values, type=_arrow_type(feature["dtype"]))
+        kind = "bool_" if feature["dtype"] == "bool" else feature["dtype"]
+        flat = pa.array(values, type=getattr(pa, kind)())
         arrays[key] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
     return pa.table(arrays)
-
-
-def _arrow_type(dtype: str) -> pa.DataType:
-    return pa.bool_() if dtype == "bool" else getattr(pa, dtype)()

@@ -164,7 +164,7 @@ def _rows(
     features: Sequence[Feature],
     policy: Policy,
 ) -> Iterator[EpisodeRows]:
-    """The checked arrays of an episode; nothing if it has a problem that the policy lets pass."""
+    """The checked arrays of an episode; none if it has a problem that the policy lets pass."""
     problems = list(_row_problems(layout, episode, table))
     values = {}
     for feature in features:
