@@ -90,9 +90,8 @@ def summed_up(problems: Iterable[DatasetError]) -> list[str]:
     """
     kinds: dict[str, list[DatasetError]] = {}
     for problem in problems:
-        kinds.setdefault(re.sub(r"[-+]?[\d.]+(e[-+]?\d+)?", "#", str(problem)), []).append(
-            problem
-        )
+        kind = re.sub(r"[-+]?[\d.]+(e[-+]?\d+)?", "#", str(problem))
+        kinds.setdefault(kind, []).append(problem)
     lines = []
     for first, *others in kinds.values():
         line = str(first)

@@ -66,7 +66,6 @@ def draw_figures(
             shade(axes, spans)
             plot_local(axes, model, operator, column, demonstrations, shown)
             axes.set_ylabel(label)
-            axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
         drawings[name] = drawing
     drawings["figure_6"] = figure(
         1,
@@ -77,8 +76,9 @@ def draw_figures(
     [axes] = drawings["figure_6"].axes
     shade(axes, spans)
     plot_candidates(axes, reproduction, "l_shoulder_pitch", ("bottle", "canonical"))
-    axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
     for drawing in drawings.values():
+        for axes in drawing.axes:
+            axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
         legend(drawing)
     return [
         save(drawing, out / f"{name}.{form}")

@@ -433,9 +433,8 @@ def _step(
     state = robot.state(joints)
     errors, rows = [], []
     for hand, target in zip(HANDS, wanted, strict=True):
-        turn = quaternions.product(
-            target.orientation, quaternions.conjugate(state.orientation(hand))
-        )
+        back = quaternions.conjugate(state.orientation(hand))
+        turn = quaternions.product(target.orientation, back)
         errors += [target.position - state.position(hand), quaternions.log(turn)]
         rows += [state.linear_jacobian(hand), state.angular_jacobian(hand)]
     error, jacobian = torch.cat(errors, dim=-1), torch.cat(rows, dim=-2)

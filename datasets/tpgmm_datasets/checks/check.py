@@ -168,11 +168,9 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         if 2 * len(ahead) > len(both):
             ahead, order = [i for i in both if i not in ahead], (second, first)
         if 0 < len(ahead) <= len(both) / 4:
-            message = (
-                f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
-                f"{listed([str(i) for i in ahead])}"
-            )
-            yield Finding("events", message, BY_HAND, order, tuple(ahead))
+            message = f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
+            these = listed([str(i) for i in ahead])
+            yield Finding("events", message + these, BY_HAND, order, tuple(ahead))
 
 
 def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:

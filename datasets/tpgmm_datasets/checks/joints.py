@@ -68,9 +68,8 @@ def joint_findings(
         limits = np.stack((as_array(robot.lower), as_array(robot.upper)))
     excess = np.maximum(limits[0] - low, high - limits[1])
     if not np.isfinite(limits).any():
-        yield from _units(
-            names, low, high, angles, FAR if isinstance(robot, Poses) else LARGEST_ANGLE
-        )
+        limit = FAR if isinstance(robot, Poses) else LARGEST_ANGLE
+        yield from _units(names, low, high, angles, limit)
     if robot is not None and excess.max(initial=0) <= IMPOSSIBLE:  # else speeds are wrong too
         yield from _speeds(episodes, names, as_array(robot.velocity))
     yield from _steps(episodes, names, [i for i in angles if largest[i] <= LARGEST_ANGLE])

@@ -150,16 +150,20 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
     if names is not None and (len(names) != count or len(set(names)) < count):
         message = f"joint_names must give {count} different names, got {len(names)}: {names}"
         raise DatasetError(message, column=feature.key)
-    if robot is None:
-        return names
-    if names is None and count == len(robot.joint_names) == 1:
+    return names if robot is None else _robots_names(feature, names, robot)
+
+
+def _robots_names(
+    feature: Feature, names: tuple[str, ...] | None, robot: Any
+) -> tuple[str, ...]:
+    if names is None and feature.width == len(robot.joint_names) == 1:
         names = tuple(robot.joint_names)
     if names is None:
         joints = f"the robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}"
         message = (
-            f"the set does not name its {count} values, nor say which are {joints}. {NAME_ALL}"
+            f"the set does not name its {feature.width} values, nor say which are {joints}"
         )
-        raise DatasetError(message, column=feature.key)
+        raise DatasetError(f"{message}. {NAME_ALL}", column=feature.key)
     matched = match_names(robot.joint_names, names, feature.key)
     return tuple(matched.get(name, name) for name in names)
 

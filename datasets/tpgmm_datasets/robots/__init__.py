@@ -156,9 +156,8 @@ def end_links(model: UrdfModel) -> tuple[str, ...]:
     """
     above = {joint.child: joint for joint in model.joints}
     carriers = {joint.parent for joint in model.movable.values() if is_gripper(joint.name)}
-    carriers |= {
-        link for link in model.links if re.fullmatch("(.*_)?(l|r|left|right)_hand", link)
-    }
+    hand = re.compile("(.*_)?(l|r|left|right)_hand")
+    carriers |= {link for link in model.links if hand.fullmatch(link)}
     parents, found = {joint.parent for joint in model.joints}, []
     for carrier in (link for link in model.links if link in carriers):
         link, fixed = carrier, [carrier]
