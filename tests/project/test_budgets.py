@@ -54,7 +54,7 @@ CEILINGS = {
     "lines of lerobot_policy_tpgmm": 1920,
     "lines of tpgmm_tools": 2840,
     "lines of environments and evaluation": 8950,
-    "lines of tests of core, data sets, policy and tools": 19310,
+    "lines of tests of core, data sets, policy and tools": 19330,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,
 }
