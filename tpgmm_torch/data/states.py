@@ -8,7 +8,7 @@ __all__ = ["changed"]
 def changed[State](state: State, **values: Any) -> State:
     """A frozen dataclass with other values of some fields.
 
-    :func:`dataclasses.replace` without initialising it again, which for twenty fields takes
+    ``dataclasses.replace`` without initialising it again, which for twenty fields takes
     longer than what a tick computes of them.
 
     Parameters
