@@ -405,8 +405,9 @@ def _check_fields(made: Any, given: Mapping[str, Any]) -> None:
             # their squares have to be finite in float32, too
             if not value.float().square().isfinite().all():
                 raise DataError(f"{name} holds NaN, or numbers that are too large")
-        if not (skill.time.diff() > 0).all():
-            raise DataError("time does not increase")
+        ends = torch.tensor([-torch.inf, skill.begin, skill.end, torch.inf]).to(skill.time)
+        if not (torch.cat((ends.diff(), skill.time.diff())) > 0).all():
+            raise DataError("time does not increase from the skill's beginning to its end")
 
 
 def _fits(value: Any, wanted: Any) -> bool:

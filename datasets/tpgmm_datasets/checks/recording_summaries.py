@@ -75,7 +75,8 @@ class RecordingSummary(EpisodeSummary):
         """Summarise a recording."""
         time, joints = as_array(demonstration.time), as_array(demonstration.joints)
         periods, steps = np.diff(time), np.diff(joints, axis=0)
-        speeds = np.abs(steps) / periods[:, None] if len(periods) else 0 * joints
+        with np.errstate(over="ignore"):  # damaged numbers
+            speeds = np.abs(steps) / periods[:, None] if len(periods) else 0 * joints
         longest = int(periods.argmax()) if len(periods) else 0
         phases = np.linspace(0, len(time) - 1, PHASES).round().astype(int)
         poses = demonstration.frames
