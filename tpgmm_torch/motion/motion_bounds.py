@@ -183,10 +183,11 @@ def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None
     known = kinematics.lower.isfinite() & False
     if given:
         known = torch.stack([bound.isfinite() for bound in given]).all(0)
+    lacking = set(kinematics.without_limits).difference(kinematics.doubtful)
     missing = [
         name
         for name, there in zip(kinematics.joint_names, known, strict=True)
-        if name in set(kinematics.without_limits).difference(kinematics.doubtful) and not there
+        if name in lacking and not there
     ]
     if missing:
         warnings.warn(

@@ -174,22 +174,20 @@ class CarryAndPut(BottleSkill):
         state = self.robot.state(starts)
         first = {hand: state.pose(hand) for hand in HANDS}
 
-        def bottle(time: Tensor) -> Frame:
-            arrived = ends[:, list(self.phases).index("close")]
+        arrived = ends[:, list(self.phases).index("close")]
+        grasped, place = bottles.compose(slide(slides)), trays.compose(FOOT_ON_TRAY)
+        ways = {"lift": _above(grasped), "carry": _above(place), "lower": place}
+
+        def bottle(time: Tensor, progress: Mapping[str, Tensor]) -> Frame:
             slid = ((time - arrived - SLIDE[0]) / SLIDE[1]).clamp(0, 1)
-            grasped, place = bottles.compose(slide(slides)), trays.compose(FOOT_ON_TRAY)
-            ways = {"lift": _above(grasped), "carry": _above(place), "lower": place}
-            pose, progress = between(bottles, grasped, slid), self._timing.progress(time, ends)
+            pose = between(bottles, grasped, slid)
             for phase, end in ways.items():
                 pose = between(pose, end, progress[phase])
             return pose
 
         def wanted(time: Tensor) -> list[Frame]:
-            progress, held = (
-                self._timing.progress(time, ends),
-                before_sliding(bottle(time), slides),
-            )
-            poses = []
+            progress = self._timing.progress(time, ends)
+            held, poses = before_sliding(bottle(time, progress), slides), []
             for hand in HANDS:
                 away = attached(held, APPROACH_POINT[hand])
                 leaving = between(attached(held, GRASP_POINT[hand]), away, progress["leave"])
@@ -198,7 +196,8 @@ class CarryAndPut(BottleSkill):
             return poses
 
         times, joints = self._follow(starts, wanted, ends)
-        path = Frame.stack([bottle(time.expand(len(starts))) for time in times])
+        each = times[:, None].expand(-1, len(starts))
+        path = Frame.stack([bottle(t, self._timing.progress(t, ends)) for t in each])
         return self._recorded(times, joints, ends, {"bottle": path, "tray": trays})
 
     def _events(self, end: Mapping[str, float]) -> dict[str, float]:

@@ -25,6 +25,7 @@ Names = Mapping[str, str] | Sequence[str]
 MEASURED = ("observation.state", "observation.states", "state", "observation.qpos")
 COMMANDED = ("action", "actions")
 JOINT_FEATURES = (*MEASURED, *COMMANDED)
+#: Parts of the names of features that may hold measured joints.
 LIKE_JOINTS = re.compile("joint|qpos|proprio|state|position", re.IGNORECASE)
 
 

@@ -397,6 +397,11 @@ class LinkPose:
             raise DatasetError(f"{text!r}: behind + is {message} ({error})") from error
         return cls(link, event, pose)
 
+    @property
+    def at(self) -> str:
+        """``LINK@EVENT``, without an offset."""
+        return f"{self.link}@{getattr(self.event, '__name__', self.event)}"
+
     def time(self, demonstration: Demonstration, **where: Any) -> float:
         """When the event is [s].
 
@@ -424,6 +429,5 @@ class LinkPose:
         pose = Frame(state.position(self.link), state.orientation(self.link))
         if self.offset is not None:
             return pose.compose(self.offset.to(pose.position))
-        event = getattr(self.event, "__name__", self.event)
-        vars(pose).update(at=f"{self.link}@{event}")
+        vars(pose).update(at=self.at)
         return pose

@@ -228,8 +228,8 @@ def _understood(
     links = ", ".join(assembly.robot.links) if assembly.robot is not None else ""
     lines["links"] = links + " (its hands; --link names others)" * bool(links and not named)
     places = {
-        name: f"{at.link}@{at.event}" if isinstance(at, LinkPose) else vars(at).get("feature")
-        for name, at in assembly.frames.items()
+        name: one.at if isinstance(one, LinkPose) else vars(one).get("feature")
+        for name, one in assembly.frames.items()
     }
     lines["frames"] = ", ".join(f"{name} ({at or 'given'})" for name, at in places.items())
     stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]

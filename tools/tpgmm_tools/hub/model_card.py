@@ -27,9 +27,9 @@ __all__ = ["describe", "model_card"]
 
 #: Rows of the table of what matters when.
 SPANS = 8
-#: Settings that a card has elsewhere, or that are of no interest to others.
-#: What Markdown reads: references, links and pictures, addresses, code, emphasis.
+#: Markup of Markdown: references, links and pictures, addresses, code, emphasis.
 MARKUP = re.compile(r"[\\`*\[\]<>!|~&:@$]|\b_|_\b|(?<=www)\.")
+#: Settings that a card has elsewhere, or that are of no interest to others.
 ELSEWHERE = {"n_components", "operators", "robot", "device"}
 USE = """```python
 from tpgmm_tools import hub
