@@ -49,7 +49,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "tried"]
+__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "validated"]
 
 #: Files of a model.
 FILES = CONFIG, TENSORS = "config.json", "model.safetensors"
@@ -156,7 +156,7 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
             f"{path} cannot be loaded onto the device {device!r}: "
             f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
         ) from error
-    return tried(decode(config.get("model"), custom, on_device))
+    return validated(decode(config.get("model"), custom, on_device))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -338,7 +338,7 @@ def decode(
 def _decoded(
     description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
-    """What an entry describes; whatever does not fit there is an error that names it."""
+    """Decode an entry; errors name it."""
     try:
         return _entry(description, entry, custom, tensors)
     except ModelFileError:
@@ -442,8 +442,8 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
         yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
 
 
-def tried(model: Any) -> Any:
-    """A model or a skill as it is, once it has been run.
+def validated(model: Any) -> Any:
+    """Validate a model or a skill by running it once; returns it.
 
     Parameters
     ----------

@@ -216,9 +216,9 @@ def _calibrated(
         message = "the metadata do not name the values: a calibration needs joint_names=[...]"
         raise DatasetError(message, column=feature.key)
     by_name: dict[str, Unit] = {**calibrated_units(calibration, names)}
-    told = {} if isinstance(units, str | Scale) else dict(units)
-    keys = told.keys() - {"*"}
-    return {n: u for n, u in by_name.items() if not any(fits(key, n) for key in keys)} | told
+    given = {} if isinstance(units, str | Scale) else dict(units)
+    keys = given.keys() - {"*"}
+    return {n: u for n, u in by_name.items() if not any(fits(key, n) for key in keys)} | given
 
 
 def select_episodes(

@@ -11,7 +11,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
-from tpgmm_tools.cli.learning import asked_operators
+from tpgmm_tools.cli.learning import operators_or_default
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
@@ -63,7 +63,7 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     _check_links(config, kinematics)
     given = config.decoded_operators() or ()
     frames = _frames(config, kinematics, given)
-    operators = asked_operators(given, kinematics, frames)
+    operators = operators_or_default(given, kinematics, frames)
     log.info("joints %s, links %s, frames %s", kinematics.joint_names, kinematics.links, frames)
     log.info("units %s, operators %s", config.units, list(map(format_operator, operators)))
     return kinematics, operators
@@ -122,7 +122,7 @@ def _names(features: Mapping[str, Any], key: str) -> list[str] | None:
 
 
 def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
-    """Whether somebody says which value is which joint of a robot."""
+    """Refuse a robot of several joints whose values have no names."""
     unnamed = {key: f"--policy.{NAMES[key]}='[...]'" for key in (OBS_STATE, ACTION)}
     unnamed = {k: text for k, text in unnamed.items() if getattr(config, NAMES[k]) is None}
     if unnamed and kinematics.n_joints > 1:

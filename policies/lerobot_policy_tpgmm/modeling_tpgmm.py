@@ -47,7 +47,7 @@ from tpgmm_torch.exceptions import (
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.persistence import decode, encode, tried
+from tpgmm_torch.persistence import decode, encode, validated
 from tpgmm_torch.robots import Kinematics, Robot
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -664,7 +664,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ),
             )
             policy = cls(config, model=model, **options).eval().to(config.device)
-            tried(policy.skill)  # with the settings of the configuration
+            validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:
             raise
         except Exception as error:  # of LeRobot, its parser and torch

@@ -95,9 +95,9 @@ class JointFeatures(nn.Module):
         called = [in_state.get(name, name) for name in state_names]
         called += [in_action[name] for name in action_names]
         every = *state_names, *action_names
-        told = units_of(_scales(units), every, called, robot, OBS_STATE)
-        self.raw = {name for name, unit in zip(called, told, strict=True) if unit == "raw"}
-        scales = [as_scale(unit, name) for name, unit in zip(every, told, strict=True)]
+        chosen = units_of(_scales(units), every, called, robot, OBS_STATE)
+        self.raw = {name for name, unit in zip(called, chosen, strict=True) if unit == "raw"}
+        scales = [as_scale(unit, name) for name, unit in zip(every, chosen, strict=True)]
         state = [scales[every.index(entry[joint])] for joint in joint_names]
         action = scales[len(state_names) :]
         buffers = {

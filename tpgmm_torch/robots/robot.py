@@ -131,7 +131,7 @@ class Robot(Described):
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
             "dtype": str(dtype).removeprefix("torch."),
         }
-        return cls(model, config, device)._told()
+        return cls(model, config, device)._warn_of_doubts()
 
     @classmethod
     def from_mjcf(
@@ -321,8 +321,8 @@ class Robot(Described):
                 self.tree, len(self.links), self.n_joints, **options
             )
 
-    def _told(self) -> Self:
-        """Itself, after one warning of all that was passed over and concerns the joints."""
+    def _warn_of_doubts(self) -> Self:
+        """Warn once of all that was passed over and concerns the joints; returns the robot."""
         joints = (self.model.joint.get(name) for name in self.joint_names)
         said = {j.name: f"{j.name!r}: {' '.join(j.doubts)}" for j in joints if j and j.doubts}
         if found := [*said.values(), *self.model.doubts]:

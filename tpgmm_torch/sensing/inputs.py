@@ -148,21 +148,21 @@ class Inputs:
     @property
     def jumped(self) -> Mask:
         """Robots (...) whose joints have jumped to where they are now."""
-        return self._nobody if self.joints is None else self.joints.jumped
+        return self._no_robots if self.joints is None else self.joints.jumped
 
     @property
     def jumping(self) -> Mask:
         """Robots (...) whose joints are read elsewhere, which is not accepted yet."""
-        return self._nobody if self.joints is None else self.joints.fault == JUMPED
+        return self._no_robots if self.joints is None else self.joints.fault == JUMPED
 
     @property
     def frozen(self) -> Mask:
         """Robots (...) whose joints have been the same to the last bit for too long."""
         joints, longest = self.joints, self.trust.joint_timeout
-        return self._nobody if joints is None else joints.same_for > longest
+        return self._no_robots if joints is None else joints.same_for > longest
 
     @property
-    def _nobody(self) -> Mask:
+    def _no_robots(self) -> Mask:
         return np.zeros(tuple(self.start.shape[:-1]), bool)
 
     @property
@@ -186,7 +186,7 @@ class Inputs:
         held : mapping of str to ndarray of bool, of shape (...)
             Robots that know where an object is without seeing it.
         """
-        old = self._nobody
+        old = self._no_robots
         for name, reading in self._readings().items():
             old |= (reading.age > self._timeout(name)) & ~held.get(name, np.False_)
         for name, age in self.ages.items():

@@ -41,7 +41,7 @@ def frame_sources(
     Raises
     ------
     DatasetError
-        If a source is none, or has not one pose for each of these episodes.
+        If a source is of no known kind, or lacks a pose for one of these episodes.
     """
     if frames is None:
         feature = layout.features.get(ENVIRONMENT)

@@ -105,7 +105,7 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
 
 
 def commanded_joints(layout: Layout, key: str) -> Iterator[Finding]:
-    """What is said where nobody chose the joints, and those of ``key`` are commanded."""
+    """The finding that commanded joints are read by default; none where ``key`` is measured."""
     if key not in COMMANDED:
         return
     others = [
@@ -130,7 +130,7 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
     Raises
     ------
     DatasetError
-        If they are not told apart, or do not fit what is ``given`` or the robot.
+        If they are not distinct, or do not fit what is ``given`` or the robot.
     """
     names, count = feature.names, feature.width
     if given == "robot":
@@ -189,6 +189,6 @@ def _units(
         warnings.warn(f"column {feature.key!r}: {differ}", DatasetWarning, stacklevel=2)
     # values of no joint are only seen by functions that find events
     mine = {*(final if robot is None else robot.joint_names)}
-    told = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
-    pairs = zip(told, final, strict=True)
+    resolved = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
+    pairs = zip(resolved, final, strict=True)
     return tuple("raw" if unit == "auto" and f not in mine else unit for unit, f in pairs)

@@ -349,7 +349,7 @@ class LinkPose:
         function from the demonstration to a time [s].
     offset : Frame, optional
         The object's pose in the link at that event. The frame is then the object's, as a
-        tracker tells it; without an offset it is the link's.
+        tracker gives it; without an offset it is the link's.
 
     Examples
     --------
@@ -373,7 +373,7 @@ class LinkPose:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """What ``LINK@EVENT`` stands for, or ``LINK@EVENT+OFFSET``.
+        """Parse ``LINK@EVENT`` or ``LINK@EVENT+OFFSET``.
 
         The offset is ``x,y,z`` [m], ``x,y,z,yaw`` [rad] or ``x,y,z,qw,qx,qy,qz``.
 

@@ -21,7 +21,7 @@ def file_path(template: str, chunk: int, file: int) -> str:
 
 
 def chunked_files(folder: Path) -> list[Path]:
-    """The parquet files in the chunks of a folder; what begins with a dot is none of them."""
+    """The parquet files in the chunks of a folder; without hidden ones."""
     return sorted(folder.glob("[!.]*/[!.]*.parquet"))
 
 

@@ -19,8 +19,8 @@ from tpgmm_tools.cli import options
 from tpgmm_tools.cli.learning import (
     Choices,
     aligner,
-    asked_operators,
     learn,
+    operators_or_default,
     parse_parts,
     prepared,
 )  # fmt: skip
@@ -157,10 +157,10 @@ def fit(
             fitted = aligner(alignment, robot)
             fitted = fitted and fitted.fit(first)
             first = fitted.transform(first) if fitted else first
-        model.operators = asked_operators(operators, robot, list(first[0].frames))
+        model.operators = operators_or_default(operators, robot, list(first[0].frames))
         kept = prepared(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
-            _echo(_understood(recording, read, kept, described.link))
+            _echo(_recording_summary(recording, read, kept, described.link))
         episodes = processes.share(kept)
         if batch_episodes is not None:
             batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **about)
@@ -203,10 +203,10 @@ class Aligned:
             yield with_holds(aligned, self.holds)
 
 
-def _understood(
+def _recording_summary(
     recording: Recording, read: Any, kept: Any, named: list[str] | None
 ) -> dict[str, object]:
-    """What the data set and the robot are taken for, before anything is learned."""
+    """Summary of the data set and the robot, before anything is learned."""
     assembly, joints = recording.assembly, recording.assembly.joints
     names = assembly.robot.joint_names if assembly.robot is not None else joints.names or ()
     lines: dict[str, object] = {}

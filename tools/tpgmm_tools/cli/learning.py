@@ -29,7 +29,7 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "aligner", "asked_operators", "learn", "parse_parts", "prepared"]
+__all__ = ["Choices", "aligner", "learn", "operators_or_default", "parse_parts", "prepared"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def aligner(
     return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
 
 
-def asked_operators(
+def operators_or_default(
     given: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
 ) -> list[Operator]:
     """The operators that are given, or all links seen from all frames, and the joints.
