@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINKED = ("tpgmm_torch", "datasets", "tools", "policies", "environments", "evaluation", "tests")
+LINKED = ("tpgmm_torch", "datasets", "tools", "vision", "policies", "environments", "evaluation", "tests")
 
 #: A mutant is equivalent by rule if its line is the original one once these are blanked.
 #: mutmut leaves alone annotations, docstrings, defaults other than numbers and names,
@@ -36,7 +36,7 @@ SETTINGS = """
 [tool.mutmut]
 source_paths = ["tpgmm_torch"]
 only_mutate = ["tpgmm_torch/{room}/*.py"]
-also_copy = ["datasets", "tools", "policies", "environments", "evaluation"]
+also_copy = ["datasets", "tools", "vision", "policies", "environments", "evaluation"]
 pytest_add_cli_args_test_selection = ["tests/tpgmm_torch/{room}"]
 # the server forks tests from a process that has imported everything and run nothing
 process_isolation = "forkserver"

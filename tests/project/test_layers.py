@@ -46,6 +46,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("episode_batches", "signals"),
         ("bottle", "text"),
     ),
+    "tpgmm_vision": (
+        ("poses",),
+        ("camera", "targets", "sources"),
+        ("cell",),
+    ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
         ("cli",),
@@ -112,6 +117,7 @@ def sources(folder: Path) -> dict[str, ast.Module]:
 FOLDERS = {
     "tpgmm_torch": ROOT / "tpgmm_torch",
     "tpgmm_datasets": ROOT / "datasets" / "tpgmm_datasets",
+    "tpgmm_vision": ROOT / "vision" / "tpgmm_vision",
     "tpgmm_tools": ROOT / "tools" / "tpgmm_tools",
     "lerobot_policy_tpgmm": ROOT / "policies" / "lerobot_policy_tpgmm",
     "lerobot_env_bimanual": ROOT / "environments" / "lerobot_env_bimanual",
@@ -291,7 +297,9 @@ def test_optional_packages_are_not_imported_at_module_level():
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("package", ["tpgmm_torch", "tpgmm_datasets", "tpgmm_tools"])
+@pytest.mark.parametrize(
+    "package", ["tpgmm_torch", "tpgmm_datasets", "tpgmm_tools", "tpgmm_vision"]
+)
 def test_lerobot_is_imported_nowhere(package):
     wrong = [
         module

@@ -19,7 +19,10 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[2]
 #: The folder of each distribution, and its packages.
 DISTRIBUTIONS = {
-    "tpgmm_torch": (ROOT, ("tpgmm_torch", "datasets/tpgmm_datasets", "tools/tpgmm_tools")),
+    "tpgmm_torch": (
+        ROOT,
+        ("tpgmm_torch", "datasets/tpgmm_datasets", "tools/tpgmm_tools", "vision/tpgmm_vision"),
+    ),
     "lerobot_policy_tpgmm": (ROOT / "policies", ("lerobot_policy_tpgmm",)),
     "lerobot_env_bimanual": (ROOT / "environments", ("lerobot_env_bimanual",)),
     "tpgmm_evaluation": (ROOT / "evaluation", ("tpgmm_evaluation",)),

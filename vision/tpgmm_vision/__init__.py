@@ -1,0 +1,1 @@
+"""Poses of objects from cameras: printed tags, calibration by the robot itself, tracking."""

@@ -1,0 +1,386 @@
+"""The cell file: cameras, objects with tags, tags that check, offsets of joints.
+
+A JSON file, written by ``tpgmm calibrate`` and edited by hand. Poses are ``[x, y, z, qw, qx,
+qy, qz]`` [m]; the base frame is that of the robot's description.
+
+.. code-block:: json
+
+    {
+      "cameras": {
+        "front": {
+          "key": "observation.images.front",
+          "size": [640, 480], "focal_length": [554.0, 554.0], "principal_point": [319.5, 239.5],
+          "distortion": [0.0, 0.0, 0.0, 0.0, 0.0],
+          "pose": [0.9, 0.4, 0.6, 0.35, 0.26, 0.54, 0.72]
+        }
+      },
+      "objects": {
+        "cup": {"target": {"cube": [10, 11, 12, 13, 14], "size": 0.04},
+                "pose": [0.0, 0.0, -0.08, 1.0, 0.0, 0.0, 0.0], "upright": true}
+      },
+      "checks": {"base": {"target": {"tag": 0, "size": 0.06},
+                          "pose": [0.1, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0]}},
+      "joints": ["shoulder_pan", "shoulder_lift"],
+      "joint_offsets": {"shoulder_lift": 0.012}
+    }
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tpgmm_torch.atomic import read_whole, replacing
+from tpgmm_torch.exceptions import DataError
+from tpgmm_vision.camera import Camera
+from tpgmm_vision.poses import Array, pose_matrix, pose_vector
+from tpgmm_vision.targets import Target, target_from
+
+__all__ = [
+    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "read_cell", "write_cell",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CellCamera:
+    """A camera of a cell.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its intrinsics.
+    key : str
+        Its feature in data sets and observations.
+    pose : ndarray of shape (4, 4), optional
+        Of the camera in the base frame, or in that of ``link``; None before ``tpgmm calibrate
+        cell``.
+    link : str, optional
+        The link that carries it.
+    """
+
+    camera: Camera
+    key: str
+    pose: Array | None = None
+    link: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CellObject:
+    """An object with tags on it.
+
+    Parameters
+    ----------
+    target : Target
+    pose : ndarray of shape (4, 4)
+        Of the object's frame in that of the target.
+    upright : bool
+        Whether its z axis is always vertical.
+    height : float, optional
+        Of its origin in the base frame, while nobody holds it [m].
+    """
+
+    target: Target
+    pose: Array
+    upright: bool = False
+    height: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CellCheck:
+    """A tag that stands still, by which a camera that was moved is noticed.
+
+    Parameters
+    ----------
+    target : Target
+    pose : ndarray of shape (4, 4)
+        Of the target in the base frame.
+    """
+
+    target: Target
+    pose: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What a workcell is to its cameras.
+
+    Parameters
+    ----------
+    cameras, objects, checks : mapping of str to CellCamera, CellObject, CellCheck
+    joint_offsets : mapping of str to float
+        What is added to measured joints to make them those of the robot's description [rad].
+    joints : tuple of str
+        Of the robot that it was calibrated with; empty if that was none.
+    source : str, default="tags"
+        What finds the objects, by the name of its entry point,
+        :data:`tpgmm_vision.sources.SOURCES`.
+    content : mapping
+        What a file says of it, from which :func:`cell_from` makes it.
+    """
+
+    cameras: Mapping[str, CellCamera] = field(default_factory=dict)
+    objects: Mapping[str, CellObject] = field(default_factory=dict)
+    checks: Mapping[str, CellCheck] = field(default_factory=dict)
+    joint_offsets: Mapping[str, float] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
+    source: str = "tags"
+    content: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Links that carry cameras."""
+        found = (one.link for one in self.cameras.values())
+        return tuple(dict.fromkeys(link for link in found if link is not None))
+
+    def placed(self) -> dict[str, CellCamera]:
+        """The cameras, all of which have a pose.
+
+        Raises
+        ------
+        DataError
+            If one has none, or there are none.
+        """
+        missing = [name for name, one in self.cameras.items() if one.pose is None]
+        if missing or not self.cameras:
+            raise DataError(
+                f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
+                if missing
+                else "the cell has no cameras: tpgmm calibrate camera adds one"
+            )
+        return dict(self.cameras)
+
+
+def read_cell(path: str | Path) -> Cell:
+    """Read a cell file.
+
+    Raises
+    ------
+    DataError
+        If it is no cell; the message names the entry.
+    OSError
+        If it cannot be read.
+    """
+    try:
+        content = json.loads(read_whole(path))
+    except ValueError as error:
+        raise DataError(f"{path} is no JSON file: {error}") from error
+    return cell_from(content, str(path))
+
+
+def write_cell(content: Mapping[str, Any], path: str | Path) -> Cell:
+    """Write a cell file, as a whole or not at all.
+
+    Parameters
+    ----------
+    content : mapping
+        As the module says.
+
+    Raises
+    ------
+    DataError
+        If it is no cell. Nothing is written then.
+    """
+    cell = cell_from(content, str(path))
+    with replacing(path) as new:
+        new.write_text(_formatted(content), encoding="utf-8")
+    return cell
+
+
+def _formatted(content: Mapping[str, Any]) -> str:
+    """JSON in which lists of numbers take one line each."""
+    lists: list[str] = []
+
+    def short(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: short(one) for key, one in value.items()}
+        if isinstance(value, list | tuple | np.ndarray):
+            lists.append(json.dumps(np.asarray(value).tolist()))
+            return f"\0{len(lists) - 1}\0"
+        return value
+
+    text = json.dumps(short(content), indent=2)
+    for number, one in enumerate(lists):
+        text = text.replace(f'"\\u0000{number}\\u0000"', one)
+    return text + "\n"
+
+
+def cell_from(content: Any, where: str = "the cell") -> Cell:
+    """A cell of the content of its file.
+
+    Raises
+    ------
+    DataError
+        If it is no cell; the message begins with ``where`` and names the entry.
+    """
+    parts: dict[str, Callable[[_Entry], Any]] = {
+        "cameras": _camera,
+        "objects": _object,
+        "checks": _check,
+        "joint_offsets": lambda entry: entry.number(),
+    }
+    root = _Entry(content, where)
+    root.allow(*parts)
+    made = {
+        part: {name: make(one) for name, one in root.items(part)}
+        for part, make in parts.items()
+    }
+    cell = Cell(**made, content=content)
+    _check_unique(cell, where)
+    return cell
+
+
+def _check_unique(cell: Cell, where: str) -> None:
+    """Each tag and each picture belongs to one entry."""
+    targets = [*cell.objects.items(), *cell.checks.items()]
+    owners: dict[tuple[str, int], str] = {}
+    for name, one in targets:
+        for number in one.target.corners:
+            other = owners.setdefault((one.target.family, number), name)
+            if other != name:
+                raise DataError(f"{where}: tag {number} belongs to {other!r} and to {name!r}")
+    if both := cell.objects.keys() & cell.checks.keys():
+        raise DataError(f"{where}: {sorted(both)} are objects and checks")
+    keys = [one.key for one in cell.cameras.values()]
+    if len(set(keys)) < len(keys):
+        raise DataError(f"{where}: cameras share a key, got {keys}")
+
+
+@dataclass
+class _Entry:
+    """A value of the file, and where it is."""
+
+    value: Any
+    where: str
+
+    def allow(self, *names: str) -> None:
+        """Refuse what is no object, and other names."""
+        if not isinstance(self.value, Mapping):
+            raise DataError(f"{self.where} is an object with {list(names)}, got {self.value!r}")
+        if extra := [name for name in self.value if name not in names]:
+            raise DataError(f"{self.where} has no entries {extra}; there are {list(names)}")
+
+    def get(self, name: str) -> _Entry | None:
+        """An entry of it, if there is one."""
+        value = self.value.get(name)
+        return None if value is None else _Entry(value, f"{self.where}: {name}")
+
+    def need(self, name: str) -> _Entry:
+        """An entry of it that must be there."""
+        if (found := self.get(name)) is None:
+            raise DataError(f"{self.where} needs {name!r}; it has {list(self.value)}")
+        return found
+
+    def items(self, name: str) -> list[tuple[str, _Entry]]:
+        """The entries of an object in it; none where it is missing."""
+        if (found := self.get(name)) is None:
+            return []
+        if not isinstance(found.value, Mapping):
+            raise DataError(f"{found.where} is an object of named entries, got {found.value!r}")
+        return [(key, _Entry(one, f"{found.where}: {key}")) for key, one in found.value.items()]
+
+    def numbers(self, n: int) -> list[float]:
+        """So many finite numbers."""
+        values = self.value if isinstance(self.value, list | tuple) else [self.value]
+        number = all(
+            isinstance(one, int | float) and not isinstance(one, bool) for one in values
+        )
+        if not number or len(values) != n or not all(map(math.isfinite, values)):
+            wanted = f"{n} finite numbers" if n > 1 else "a finite number"
+            raise DataError(f"{self.where} is {wanted}, got {self.value!r}")
+        return [float(one) for one in values]
+
+    def number(self) -> float:
+        """A finite number."""
+        return self.numbers(1)[0]
+
+    def text(self) -> str:
+        """A text that is not empty."""
+        if not isinstance(self.value, str) or not self.value:
+            raise DataError(f"{self.where} is a text, got {self.value!r}")
+        return self.value
+
+    def texts(self) -> tuple[str, ...]:
+        """Texts that are not empty."""
+        if not isinstance(self.value, list | tuple):
+            raise DataError(f"{self.where} is a list of texts, got {self.value!r}")
+        return tuple(_Entry(one, self.where).text() for one in self.value)
+
+    def flag(self) -> bool:
+        """True or false."""
+        if not isinstance(self.value, bool):
+            raise DataError(f"{self.where} is true or false, got {self.value!r}")
+        return self.value
+
+    def pose(self) -> Array:
+        """A pose (4, 4)."""
+        values = self.numbers(7)
+        try:
+            return pose_matrix(values)
+        except DataError as error:
+            raise DataError(f"{self.where}: {error}") from error
+
+
+def _camera(entry: _Entry) -> CellCamera:
+    numbers = {"size": 2, "focal_length": 2, "principal_point": 2}
+    entry.allow("key", *numbers, "distortion", "pose", "link", "report")
+    size, focal_length, principal_point = (
+        entry.need(name).numbers(n) for name, n in numbers.items()
+    )
+    distortion = entry.get("distortion")
+    lens = distortion.numbers(5) if distortion else [0.0] * 5
+    try:
+        camera = Camera(
+            int(size[0]), int(size[1]), (focal_length[0], focal_length[1]),
+            (principal_point[0], principal_point[1]), tuple(lens),
+        )  # fmt: skip
+    except DataError as error:
+        raise DataError(f"{entry.where}: {error}") from error
+    pose, link = entry.get("pose"), entry.get("link")
+    return CellCamera(
+        camera, entry.need("key").text(), pose and pose.pose(), link and link.text()
+    )
+
+
+def _object(entry: _Entry) -> CellObject:
+    entry.allow("target", "pose", "upright", "height")
+    pose, upright, height = (entry.get(name) for name in ("pose", "upright", "height"))
+    return CellObject(
+        _target(entry.need("target")),
+        np.eye(4) if pose is None else pose.pose(),
+        upright is not None and upright.flag(),
+        height and height.number(),
+    )
+
+
+def _check(entry: _Entry) -> CellCheck:
+    entry.allow("target", "pose")
+    return CellCheck(_target(entry.need("target")), entry.need("pose").pose())
+
+
+def _target(entry: _Entry) -> Target:
+    if not isinstance(entry.value, Mapping):
+        wanted = 'an object such as {"tag": 3, "size": 0.06}'
+        raise DataError(f"{entry.where} is {wanted}, got {entry.value!r}")
+    return target_from(entry.value, entry.where)
+
+
+def camera_content(camera: Camera, key: str) -> dict[str, Any]:
+    """What a cell file says of a camera without a pose."""
+    return {
+        "key": key,
+        "size": [camera.width, camera.height],
+        "focal_length": list(camera.focal_length),
+        "principal_point": list(camera.principal_point),
+        "distortion": list(camera.distortion),
+    }
+
+
+def pose_content(pose: Array) -> list[float]:
+    """What a file says of a pose: rounded to a micrometre and a microradian."""
+    return [round(float(one), 7) for one in pose_vector(pose)]
