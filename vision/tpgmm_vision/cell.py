@@ -225,19 +225,30 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
         "joint_offsets": lambda entry: entry.number(),
     }
     root = _Entry(content, where)
-    root.allow(*parts)
-    made = {
+    root.allow(*parts, "joints", "source")
+    made: dict[str, Any] = {
         part: {name: make(one) for name, one in root.items(part)}
         for part, make in parts.items()
     }
-    cell = Cell(**made, content=content)
+    joints, source = root.get("joints"), root.get("source")
+    cell = Cell(
+        **made,
+        joints=() if joints is None else joints.texts(),
+        source="tags" if source is None else source.text(),
+        content=content,
+    )
+    if joints is not None and (extra := cell.joint_offsets.keys() - set(cell.joints)):
+        raise DataError(
+            f"{where}: joint_offsets of {sorted(extra)}, which are not among joints"
+        )
     _check_unique(cell, where)
     return cell
 
 
 def _check_unique(cell: Cell, where: str) -> None:
     """Each tag and each picture belongs to one entry."""
-    targets = [*cell.objects.items(), *cell.checks.items()]
+    targets: list[tuple[str, CellObject | CellCheck]] = list(cell.objects.items())
+    targets += cell.checks.items()
     owners: dict[tuple[str, int], str] = {}
     for name, one in targets:
         for number in one.target.corners:
@@ -343,7 +354,10 @@ def _camera(entry: _Entry) -> CellCamera:
         raise DataError(f"{entry.where}: {error}") from error
     pose, link = entry.get("pose"), entry.get("link")
     return CellCamera(
-        camera, entry.need("key").text(), pose and pose.pose(), link and link.text()
+        camera,
+        entry.need("key").text(),
+        None if pose is None else pose.pose(),
+        None if link is None else link.text(),
     )
 
 
@@ -354,7 +368,7 @@ def _object(entry: _Entry) -> CellObject:
         _target(entry.need("target")),
         np.eye(4) if pose is None else pose.pose(),
         upright is not None and upright.flag(),
-        height and height.number(),
+        None if height is None else height.number(),
     )
 
 
