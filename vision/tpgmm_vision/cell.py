@@ -296,12 +296,10 @@ class _Entry:
         return [(key, _Entry(one, f"{found.where}: {key}")) for key, one in found.value.items()]
 
     def numbers(self, n: int) -> list[float]:
-        """So many finite numbers."""
+        """A list of ``n`` finite numbers."""
         values = self.value if isinstance(self.value, list | tuple) else [self.value]
-        number = all(
-            isinstance(one, int | float) and not isinstance(one, bool) for one in values
-        )
-        if not number or len(values) != n or not all(map(math.isfinite, values)):
+        plain = all(type(one) in (int, float) for one in values)
+        if not plain or len(values) != n or not all(map(math.isfinite, values)):
             wanted = f"{n} finite numbers" if n > 1 else "a finite number"
             raise DataError(f"{self.where} is {wanted}, got {self.value!r}")
         return [float(one) for one in values]
