@@ -43,7 +43,7 @@ from tpgmm_datasets.lerobot.statistics import (
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
-__all__ = ["Column", "add_frames", "save_lerobot"]
+__all__ = ["Column", "add_frames", "open_to_copy", "save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -215,15 +215,7 @@ def add_frames(
         already, or its poses do not fit to the episodes. There is no copy then.
     """
     path, out = local_folder(path), Path(out)
-    layout = open_layout(path)
-    for problem in layout.problems:
-        raise problem
-    if layout.version != "v3.0" or not layout.episodes:
-        raise DatasetError(
-            f"frames are added to sets of v3.0, this is {layout.version} with "
-            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
-            "LeRobot's own converter, which keeps videos)"
-        )
+    layout = open_to_copy(path, out)
     sources = frame_sources(layout, frames, layout.episodes)
     if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
         raise DatasetError(
@@ -241,8 +233,7 @@ def add_frames(
         info = {**(features[key].get("info") or {}), "offsets": list(shifts)}
         features[key] = {**features[key], "info": info}
     with replacing(out) as new:
-        if out.exists():
-            raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
+        open_to_copy(path, out)
         hidden = shutil.ignore_patterns(".*")
         shutil.copytree(path, new, ignore=hidden, copy_function=_link_videos)
         found = dict[int, Statistics]()
@@ -281,6 +272,28 @@ def add_frames(
         for name, text in (files or {}).items():
             (new / name).write_text(text, encoding="utf-8")
     return out
+
+
+def open_to_copy(path: Path, out: Path) -> Layout:
+    """The layout of a set to which :func:`add_frames` can add.
+
+    Raises
+    ------
+    DatasetError
+        If it is damaged, of another version or empty, or the folder of the copy exists.
+    """
+    layout = open_layout(path)
+    for problem in layout.problems:
+        raise problem
+    if layout.version != "v3.0" or not layout.episodes:
+        raise DatasetError(
+            f"frames are added to sets of v3.0, this is {layout.version} with "
+            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
+            "LeRobot's own converter, which keeps videos)"
+        )
+    if out.exists():
+        raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
+    return layout
 
 
 def _link_videos(source: str, target: str) -> None:
