@@ -1,4 +1,4 @@
-"""The pose of a target from the corners of its tags, with its uncertainty, or why there is none.
+"""The pose of a target from the corners of its tags, its uncertainty, or why there is none.
 
 A flat tag that is seen from the front has two poses that explain its corners nearly as well.
 All such hypotheses of all tags are fitted to all corners by Gauss-Newton; a pose is only valid
@@ -8,7 +8,7 @@ if the next best one explains them clearly worse.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -76,6 +76,8 @@ class PoseEstimate:
         Why it is not valid.
     tags : tuple of int
         Those that count.
+    alternative : ndarray of shape (4, 4), optional
+        The other pose, where two explain what is seen.
     """
 
     pose: Array
@@ -84,6 +86,7 @@ class PoseEstimate:
     valid: bool
     reason: str
     tags: tuple[int, ...]
+    alternative: Array | None = None
 
 
 def estimate_pose(
@@ -129,12 +132,12 @@ def estimate_pose(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A hypothesis that was fitted, and how well the next best fits."""
+    """A hypothesis that was fitted, and the next best."""
 
     pose: Array
     cost: float
     information: Array
-    second: float
+    second: _Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -240,14 +243,13 @@ class _Problem:
         rivals = [
             guesses[k] for k in order[1:] if angle_between(guesses[k], first.pose) > DISTINCT
         ]
-        second = np.inf
         if rivals:
             other = self.descended(rivals[0], known)
             if angle_between(other.pose, first.pose) > DISTINCT:
                 if other.cost < first.cost:
                     first, other = other, first
-                second = other.cost
-        return _Fit(first.pose, first.cost, first.information, second)
+                return replace(first, second=other)
+        return first
 
     def descended(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
         """Gauss-Newton with damping."""
@@ -267,7 +269,7 @@ class _Problem:
                     break
             else:
                 damping = max(10 * damping, 1e-2)
-        return _Fit(pose, cost, information, np.inf)
+        return _Fit(pose, cost, information)
 
     def system(
         self, pose: Array, known: tuple[bool, float | None] | None
@@ -284,7 +286,7 @@ class _Problem:
                 turn[0, 3:], turn[1, 3:] = (0, axis[2], -axis[1]), (-axis[2], 0, axis[0])
                 # further than a quarter turn away it is no nearer
                 away = (
-                    axis[:2] if axis[2] > 0 else axis[:2] / max(np.linalg.norm(axis[:2]), 1e-3)
+                    axis[:2] if axis[2] > 0 else axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3)
                 )
                 residual = np.append(residual, away / UPRIGHT_STD)
                 rates = np.concatenate((rates, turn / UPRIGHT_STD))
@@ -295,14 +297,14 @@ class _Problem:
 
     def judged(self, fit: _Fit, misfit: float) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
-        covariance = np.linalg.pinv(fit.information, hermitian=True) * max(misfit, 1)
+        covariance: Array = np.linalg.pinv(fit.information, hermitian=True) * max(misfit, 1)
         position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
                           (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
-        reason = ""
+        reason, alternative = "", None
         if misfit > MOST_MISFIT**2:
             reason = "the corners of its tag fit no pose"
-        elif fit.second < LEAST_RATIO * max(fit.cost, self.freedom):
-            reason = "two poses explain what is seen"
+        elif fit.second and fit.second.cost < LEAST_RATIO * max(fit.cost, self.freedom):
+            reason, alternative = "two poses explain what is seen", fit.second.pose
         elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
             reason = (
                 f"it is uncertain by {1e3 * position:.0f} mm and {np.degrees(turn):.0f} deg: "
@@ -310,7 +312,9 @@ class _Problem:
             )
         errors = np.concatenate([one.errors(fit.pose) for one in self.seen])
         residual = float(np.sqrt(np.mean(np.square(errors).sum(-1))))
-        return PoseEstimate(fit.pose, covariance, residual, not reason, reason, self.tags)
+        return PoseEstimate(
+            fit.pose, covariance, residual, not reason, reason, self.tags, alternative
+        )
 
 
 def _hypotheses(seen: _Seen) -> list[Array]:

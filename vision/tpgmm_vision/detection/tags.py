@@ -116,7 +116,7 @@ class TagDetector:
             if min(part.shape, default=0) < self._modules:
                 continue
             for number, corners in self._rough(part):
-                corners = corners + (left, top)
+                corners += np.array([left, top])
                 if number in rough and np.abs(rough[number] - corners).max() > 2:
                     twice.add(number)
                 rough.setdefault(number, corners)
