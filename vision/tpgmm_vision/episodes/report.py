@@ -16,13 +16,13 @@ from tpgmm_vision.episodes.smoothing import Flags, Track
 from tpgmm_vision.episodes.video import Picture
 from tpgmm_vision.poses import Array
 
-__all__ = ["EpisodeReport", "drawn", "rows_to_show", "table"]
+__all__ = ["EpisodeReport", "drawn", "report_page", "table"]
 
 HEAD = (
     "episode", "object", "seen", "inferred", "unknown", "longest gap", "spread at rest",
     "residual", "worst",
 )  # fmt: skip
-#: Colours (RGB) of corners that were seen and that were expected, and the width of what is shown.
+#: Colours (RGB) of corners that were seen and that were expected, and the width of pictures.
 SEEN_COLOUR, EXPECTED_COLOUR, WIDTH = (0, 200, 0), (255, 120, 0), 480
 #: What is shown around the corners: so many times their extent, at least so many pixels.
 AROUND, LEAST_AROUND = 2.0, 100
@@ -50,14 +50,17 @@ class EpisodeReport:
         By object.
     residuals : mapping of str to ndarray of shape (T,)
         Of the corners, where they were seen [pixels].
+    reasons : mapping of str to list of str
+        Why it was not seen, in each row.
     pictures : list of (str, bytes)
         What is said of pictures, and these as JPEG.
     """
 
     index: int
     time: Array
-    tracks: Mapping[str, Track]
-    residuals: Mapping[str, Array]
+    tracks: dict[str, Track] = field(default_factory=dict)
+    residuals: dict[str, Array] = field(default_factory=dict)
+    reasons: dict[str, list[str]] = field(default_factory=dict)
     pictures: list[tuple[str, bytes]] = field(default_factory=list)
 
     def lines(self) -> list[tuple[str, ...]]:
@@ -75,6 +78,19 @@ class EpisodeReport:
             )
         return found
 
+    def rows_to_show(self) -> dict[int, str]:
+        """The rows whose pictures say most, and what they show."""
+        rows: dict[int, str] = {}
+        for name, track in self.tracks.items():
+            residual = np.where(track.seen, self.residuals[name], -1)
+            for row in residual.argsort()[::-1][: min(WORST, track.seen.sum())].tolist():
+                rows.setdefault(row, f"{name}, {residual[row]:.2f} px")
+            first, last = longest_gap(track.seen)
+            if last > first:
+                row = (first + last) // 2
+                rows.setdefault(row, f"{name} is not seen: {self.reasons[name][row]}")
+        return rows
+
     def _length(self, first: int, last: int) -> float:
         """Of rows from the first to the one before the last [s]."""
         period = float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
@@ -86,19 +102,6 @@ def longest_gap(seen: Flags) -> tuple[int, int]:
     marks = np.flatnonzero(np.concatenate(([True], seen, [True])))
     at = int(np.diff(marks).argmax())
     return int(marks[at]), int(marks[at + 1]) - 1
-
-
-def rows_to_show(report: EpisodeReport) -> dict[int, str]:
-    """The rows of an episode whose pictures say most, and why."""
-    rows: dict[int, str] = {}
-    for name, track in report.tracks.items():
-        worst = np.argsort(np.where(track.seen, report.residuals[name], -1))[::-1][:WORST]
-        for row in worst:
-            rows.setdefault(int(row), f"{name}: {report.residuals[name][row]:.2f} px")
-        first, last = longest_gap(track.seen)
-        if last > first:
-            rows.setdefault((first + last) // 2, f"{name} is not seen")
-    return rows
 
 
 def drawn(
@@ -137,7 +140,9 @@ def report_page(title: str, reports: Sequence[EpisodeReport]) -> str:
     head, *lines = table(reports)
     rows = ["".join(f"<th>{one}</th>" for one in head)]
     rows += ["".join(f"<td>{html.escape(one)}</td>" for one in line) for line in lines]
-    parts = [f"<h1>{html.escape(title)}</h1><p>Corners: green was seen, orange is expected.</p>"]
+    parts = [
+        f"<h1>{html.escape(title)}</h1><p>Corners: green was seen, orange is expected.</p>"
+    ]
     parts.append(f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>")
     for report in reports:
         parts.append(f"<h2>Episode {report.index}</h2>")

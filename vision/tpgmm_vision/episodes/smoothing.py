@@ -1,9 +1,9 @@
 """Smooth the measured poses of an object over a whole episode, looking both ways in time.
 
 Where the object is at rest, the robust mean of all its frames counts; where it moves, what was
-measured. Gaps are filled where it is known what the object did: it stood still before and after,
-a hand carried it, or the gap is short. Elsewhere the last pose is repeated, and said to be
-unknown.
+measured. Gaps are filled where it is known what the object did: it stood still before and
+after, a hand carried it, or the gap is short. Elsewhere the last pose is repeated, and said to
+be unknown.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from tpgmm_vision.poses import Array, inverse, mean_pose
 __all__ = ["Track", "smoothed"]
 
 Flags = NDArray[np.bool_]
-#: Poses are as far apart as three points at this distance from the origin, along the axes, are in
-#: the mean: an object is about as large [m].
+#: Poses are as far apart as three points on their axes are in the mean, which are so far from
+#: the origin: an object is about as large [m].
 LEVER = 0.05
 #: What moves by less, or by less than so many times the noise of a frame, is at rest [m].
 REST_DISTANCE, REST_NOISE = 0.003, 3.0
@@ -117,9 +117,9 @@ class _Smoother:
         self.rest, self.known = np.full(len(time), -1), seen.copy()
         squares = []
         for number, inside in enumerate(_rests(time[index], points, self.tolerance)):
-            mean, agree = mean_pose(poses[index[inside]])
-            inside = index[inside][agree]
-            stretch = slice(inside[0], inside[-1] + 1)
+            mean, agree = mean_pose(list(poses[index[inside]]))
+            rows = index[inside][agree]
+            stretch = slice(rows[0], rows[-1] + 1)
             at = poses[stretch][seen[stretch], :3, 3]
             squares.append(np.square(at - mean[:3, 3]).sum(axis=1))
             self.rest[stretch] = number
@@ -168,7 +168,7 @@ class _Smoother:
         return float(away[i, j]), taken[i], put[j], hand, grasps[i]
 
     def _grasps(self, link: str, at: int, gap: range, way: int) -> tuple[list[int], Array]:
-        """Rows at which a link may have begun or ended to hold the object, and its pose in it."""
+        """Rows at which a link may have taken or put down the object, and its pose in it."""
         if self.rest[at] >= 0:
             return list(gap), inverse(self.hands[link][gap.start : gap.stop]) @ self.poses[at]
         _, grasp = self._held(link, at, way)
@@ -189,7 +189,7 @@ class _Smoother:
         )
         if count < CARRIED_FRAMES or way_length.max() < CARRIED_WAY * self.tolerance:
             return count, None
-        return count, mean_pose(inside[: min(count, 4 * CARRIED_FRAMES)])[0]
+        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
 
     def finish(self, last: int) -> None:
         """Fill what follows the last known row."""
@@ -197,11 +197,12 @@ class _Smoother:
         self.poses[rows] = self.poses[last]
         if self.rest[last] >= 0:
             return
-        held = [(*self._held(link, last, -1), hand) for link, hand in self.hands.items()]
-        held = [one for one in held if one[1] is not None]
+        found = [(*self._held(link, last, -1), hand) for link, hand in self.hands.items()]
+        held = [
+            (count, hand[rows] @ grasp) for count, grasp, hand in found if grasp is not None
+        ]
         if held:
-            _, grasp, hand = max(held, key=lambda one: one[0])
-            self.fill(rows, hand[rows] @ grasp)
+            self.fill(rows, max(held, key=lambda one: one[0])[1])
 
 
 def _rests(time: Array, points: Array, tolerance: float) -> list[list[int]]:

@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
 from tpgmm_datasets.conversion.joints import Names, joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, summed_up
-from tpgmm_datasets.lerobot.columns import ENVIRONMENT, with_frames
+from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, with_frames
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
+from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
 from tpgmm_datasets.units import Units
-from tpgmm_datasets.writer import Column, add_frames
+from tpgmm_datasets.writer import Column, add_frames, open_to_copy
+from tpgmm_torch.atomic import read_whole
+from tpgmm_torch.checks.report import listed
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_vision.cell import Cell
-from tpgmm_vision.episodes.report import EpisodeReport, report_page
+from tpgmm_vision.cell import Cell, read_cell
+from tpgmm_vision.detection.tag_source import camera_poses
+from tpgmm_vision.detection.tags import TagDetector
+from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track, smoothed
-from tpgmm_vision.episodes.video import EpisodePictures
-from tpgmm_vision.poses import Array, pose_matrix, pose_vector
-from tpgmm_vision.sources import PoseSource, pose_source
+from tpgmm_vision.episodes.video import EpisodePictures, Picture
+from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transformed
+from tpgmm_vision.sources import ObservedPose, pose_source
 
 __all__ = ["track_lerobot"]
 
@@ -53,10 +58,10 @@ def track_lerobot(
     """Find the objects of a cell in the pictures of a data set, and write a copy with them.
 
     Their poses are put into ``observation.environment_state``, named as in ``cup.x`` ...
-    ``cup.qz``; ``tracking.seen`` says where they were measured, ``tracking.known`` where they were
-    measured or inferred, ``tracking.residual`` how well [pixels]. The joint offsets of the cell
-    are declared beside the units of the joints. The cell is copied to ``meta/cell.json``, and
-    ``report.html`` shows what was found.
+    ``cup.qz``; ``tracking.seen`` says where they were measured, ``tracking.known`` where they
+    were measured or inferred, ``tracking.residual`` how well [pixels]. The joint offsets of the
+    cell are declared beside the units of the joints. The cell is copied to ``meta/cell.json``,
+    and ``report.html`` shows what was found.
 
     Parameters
     ----------
@@ -99,55 +104,61 @@ def track_lerobot(
         folder, robot=robot, frames={}, joint_names=joint_names, units=units,
         calibration=calibration,
     )  # fmt: skip
-    assembly, reports, problems = recording.assembly, list[EpisodeReport](), list[DatasetError]()
+    assembly, reports, problems = (
+        recording.assembly,
+        list[EpisodeReport](),
+        list[DatasetError](),
+    )
     total, done = sum(one.length for one in layout.episodes), 0
     for rows in read_episodes(layout, recording.episodes, assembly.features, Relaxed(())):
-        count = partial(progress or _silent, total=total)
+        before = done
+
+        def advance(row: int, before: int = done) -> None:
+            if progress is not None:
+                progress(before + row, total)
+
         try:
-            shown = assembly.demonstration(rows)
-            reports.append(tracker.track(rows, shown, lambda row, n=done: count(n + row)))
+            reports.append(tracker.track(rows, assembly.demonstration(rows), advance))
+        except DatasetError as error:
+            problems.append(error)
         except DataError as error:
-            known = isinstance(error, DatasetError)
-            problems.append(error if known else DatasetError(str(error), episode=rows.episode.index))
+            problems.append(DatasetError(str(error), episode=rows.episode.index))
         done += len(rows.time)
-        count(done)
+        advance(len(rows.time), before)
     if problems:
         raise _untracked(problems, path)
-    columns = {
-        SEEN: lambda report, name: report.tracks[name].seen,
-        KNOWN: lambda report, name: report.tracks[name].known,
-        RESIDUAL: lambda report, name: report.residuals[name].astype(np.float32),
-    }
     objects = list(reports[0].tracks)
+    frames = {
+        name: {one.index: _frame(one.tracks[name]) for one in reports} for name in objects
+    }
     add_frames(
-        folder,
-        out,
-        {name: {one.index: _frame(one.tracks[name]) for one in reports} for name in objects},
-        columns={
-            key: Column(
-                objects,
-                {one.index: np.stack([get(one, n) for n in objects], 1) for one in reports},
-            )
-            for key, get in columns.items()
-        },
-        offsets=offsets,
+        folder, out, frames, columns=_columns(reports, objects), offsets=offsets,
         files={CELL: text, "report.html": report_page(f"{path}, tracked", reports)},
-    )
+    )  # fmt: skip
     return reports
 
 
-def _silent(done: int, total: int) -> None:
-    """No progress."""
+def _columns(reports: Sequence[EpisodeReport], objects: Sequence[str]) -> dict[str, Column]:
+    """What is stored beside the poses."""
+    values: dict[str, dict[int, Any]] = {SEEN: {}, KNOWN: {}, RESIDUAL: {}}
+    for one in reports:
+        tracks = [one.tracks[name] for name in objects]
+        residuals = [one.residuals[name] for name in objects]
+        values[SEEN][one.index] = np.stack([track.seen for track in tracks], 1)
+        values[KNOWN][one.index] = np.stack([track.known for track in tracks], 1)
+        values[RESIDUAL][one.index] = np.stack(residuals, 1).astype(np.float32)
+    return {key: Column(objects, by_episode) for key, by_episode in values.items()}
 
 
 def _untracked(problems: Sequence[DatasetError], path: str | Path) -> DatasetError:
     """One error for all episodes."""
     episodes = sorted({one.episode for one in problems if one.episode is not None})
     return DatasetError(
-        f"objects cannot be followed in episodes {listed(map(str, episodes))}: "
-        f"{'; '.join(summed_up(problems))}. Nothing is written. Record these again, or leave them out: lerobot-edit-dataset "
-        f"--repo_id {Path(path).name} --root {path} --new_root ... --operation.type "
-        f"delete_episodes --operation.episode_indices '{episodes}'"
+        f"objects cannot be followed in episodes {listed([*map(str, episodes)])}: "
+        f"{'; '.join(summed_up(problems))}. Nothing was written. Record these episodes again, "
+        f"or leave them out: lerobot-edit-dataset --repo_id {Path(path).name} --root {path} "
+        "--new_root NEW --operation.type delete_episodes --operation.episode_indices "
+        f"'{episodes}'"
     )
 
 
@@ -170,84 +181,123 @@ def _declared_offsets(
     return declared
 
 
+def _repeated(now: ObservedPose, last: ObservedPose | None) -> bool:
+    """Whether a source repeats for a moment what it measured before, and is less certain."""
+    if last is None or not np.array_equal(now.pose, last.pose):
+        return False
+    return bool(np.trace(now.covariance) > np.trace(last.covariance))
+
+
 class _Tracker:
     """Follows the objects of a cell through episodes."""
 
     def __init__(self, layout: Layout, cell: Cell, robot: Kinematics | None) -> None:
-        strange = {*cell.joints} - {*(cell.joints if robot is None else robot.joint_names)}
-        if strange:
-            raise DataError(
-                f"the cell was calibrated with a robot that has joints {sorted(strange)}, this "
-                f"one has {list(robot.joint_names) if robot else []}: it is the cell of another"
-            )
         self.cell, self.robot = cell, robot
         self.cameras = cell.placed()
         self.pictures = EpisodePictures(layout, [one.key for one in self.cameras.values()])
         self.source = pose_source(cell, robot)
+        families = {one.target.family for one in cell.objects.values()}
+        self.detectors = [TagDetector(family) for family in families]
 
     def track(
         self, rows: EpisodeRows, shown: Demonstration, progress: Callable[[int], None]
     ) -> EpisodeReport:
         """Track one episode, looking both ways in time."""
-        links = self._links(shown)
-        found = self._observed(rows, shown, progress)
-        tracks = {}
-        for name, (poses, seen, _) in found.items():
+        joints = self._joints(shown)
+        report = EpisodeReport(rows.episode.index, rows.time)
+        measured = self._measured(rows, joints, report, progress)
+        links = self._links(joints)
+        for name, (poses, seen) in measured.items():
             try:
-                tracks[name] = smoothed(rows.time, poses, seen, links)
+                report.tracks[name] = smoothed(rows.time, poses, seen, links)
             except DataError as error:
-                raise DataError(f"object {name!r}: {error}") from error
-        residuals = {name: one[2] for name, one in found.items()}
-        report = EpisodeReport(rows.episode.index, rows.time, tracks, residuals)
-        self._illustrate(report, rows, links)
+                because = "" if seen.any() else f": {report.reasons[name][-1]}"
+                raise DataError(f"object {name!r}: {error}{because}") from error
+        wanted = report.rows_to_show()
+        pictures = self.pictures.read(rows.episode, rows.time)
+        for row, images in enumerate(islice(pictures, max(wanted, default=-1) + 1)):
+            if row in wanted:
+                self._draw(report, row, images, joints[row], wanted[row])
         return report
 
-    def _links(self, shown: Demonstration) -> dict[str, Array]:
-        """Poses (T, 4, 4) of the robot's links, of its joints as they are."""
+    def _joints(self, shown: Demonstration) -> list[dict[str, float]]:
+        """Joints of the robot's description in each row, by name."""
+        names = shown.joint_names or ()
+        shifts = torch.tensor([self.cell.joint_offsets.get(name, 0.0) for name in names])
+        values = shown.joints + shifts if names else shown.joints
+        return [dict(zip(names, row, strict=False)) for row in values.tolist()]
+
+    def _links(self, joints: Sequence[Mapping[str, float]]) -> dict[str, Array]:
+        """Poses (T, 4, 4) of the robot's links."""
         robot = self.robot
         if robot is None or not getattr(robot, "orientation", True):  # tracked points have none
             return {}
-        shifts = [self.cell.joint_offsets.get(name, 0.0) for name in robot.joint_names]
-        state = robot.state(shown.joints + torch.tensor(shifts, dtype=shown.joints.dtype))
+        values = [[row[name] for name in robot.joint_names] for row in joints]
+        state = robot.state(torch.tensor(values).to(robot.lower))
         poses = {link: (state.position(link), state.orientation(link)) for link in robot.links}
-        return {link: pose_matrix(torch.cat(pose, -1).numpy()) for link, pose in poses.items()}
+        return {
+            link: pose_matrix(torch.cat(pose, -1).double().numpy())
+            for link, pose in poses.items()
+        }
 
-    def _observed(
-        self, rows: EpisodeRows, shown: Demonstration, progress: Callable[[int], None]
-    ) -> dict[str, tuple[Array, Flags, Array]]:
-        """By object, in each row: its pose, whether it was seen, and the residual [pixels]."""
-        count, names = len(rows.time), shown.joint_names or ()
-        found: dict[str, tuple[Array, Flags, Array]] = {}
+    def _measured(
+        self,
+        rows: EpisodeRows,
+        joints: Sequence[Mapping[str, float]],
+        report: EpisodeReport,
+        progress: Callable[[int], None],
+    ) -> dict[str, tuple[Array, Any]]:
+        """By object its poses (T, 4, 4), and whether it was seen in each row (T,)."""
+        count, found = len(rows.time), dict[str, tuple[Array, Any]]()
+        last = dict[str, ObservedPose]()
         self.source.reset()
-        pictures = self.pictures.read(rows.episode, rows.time)
-        for row, (images, joints) in enumerate(zip(pictures, shown.joints.tolist(), strict=True)):
-            for name, one in self.cameras.items() if row == 0 else ():
-                one.camera.check(images[one.key], name)
-            measured = dict(zip(names, joints, strict=False))
-            seen = self.source.poses(images, measured, float(rows.time[row]))
+        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
+            poses = self.source.poses(images, joints[row], float(rows.time[row]))
             if self.source.problem:
-                raise DataError(f"at {rows.time[row]:.2f} s: {self.source.problem}")
-            for name, one in seen.items():
-                new = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool), np.zeros(count)
-                poses, valid, residuals = found.setdefault(name, new)
-                if one.valid:
-                    poses[row], valid[row] = pose_matrix(one.pose), True
-                    residuals[row] = np.nan_to_num(one.residual)
+                raise DataError(f"at {rows.time[row]:.2f} s {self.source.problem}")
+            estimates = getattr(self.source, "estimates", {})
+            for name, one in poses.items():
+                if name not in found:
+                    found[name] = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+                    report.residuals[name] = np.zeros(count)
+                report.reasons.setdefault(name, []).append(one.reason)
+                if one.valid and not _repeated(one, last.get(name)):
+                    found[name][0][row], found[name][1][row] = pose_matrix(one.pose), True
+                    if name in estimates:
+                        report.residuals[name][row] = estimates[name].residual
+                    last[name] = one
             progress(row)
         return found
 
-    def _illustrate(
-        self, report: EpisodeReport, rows: EpisodeRows, links: Mapping[str, Array]
+    def _draw(
+        self,
+        report: EpisodeReport,
+        row: int,
+        images: Mapping[str, Picture],
+        joints: Mapping[str, float],
+        caption: str,
     ) -> None:
-        """Draw the pictures that fit worst."""
-        wanted = rows_to_show(report)
-        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
-            if row not in wanted:
-                continue
-            for name, one in self.cameras.items():
-                camera_from_base = _camera_from_base(one, links, row)
-                expected = {}
-                for key, thing in self.cell.objects.items():
-                    pose = report.tracks[key].poses[row] @ inverse(thing.pose)
-                    for number, corners in thing.target.corners.items():
-                        expected[number] = transformed(camera_from_base @ pose, corners)
+        """Add the pictures of a row with the corners that are seen and that are expected."""
+        places = camera_poses(self.cell, self.robot, joints)
+        for name, one in self.cameras.items():
+            seen = dict[int, Array]()
+            for detector in self.detectors:
+                seen |= detector(images[one.key]).corners
+            expected = dict[int, Array]()
+            for key, thing in self.cell.objects.items():
+                pose = (
+                    inverse(places[name]) @ report.tracks[key].poses[row] @ inverse(thing.pose)
+                )
+                for number, corners in thing.target.corners.items():
+                    points = transformed(pose, corners)
+                    pixels = one.camera.project(points)
+                    # what looks away from the camera is not seen
+                    if (
+                        cv2.contourArea(pixels.astype(np.float32), True)
+                        > 0
+                        < points[:, 2].min()
+                    ):
+                        expected[number] = pixels
+            said = f"row {row}, {report.time[row]:.2f} s, {name}: {caption}"
+            picture = drawn(images[one.key], one.camera, seen, expected)
+            report.pictures.append((said, picture))
