@@ -142,10 +142,11 @@ class TagDetector:
     def _pattern(self, number: int) -> NDArray[np.float32]:
         """The tag and white around it, 0 to 1."""
         if number not in self._patterns:
-            side, edge = self._modules * TEXTURE, [QUIET * TEXTURE] * 4
-            drawn = cv2.aruco.generateImageMarker(self._dictionary, number, side)
-            white = cv2.copyMakeBorder(drawn, *edge, cv2.BORDER_CONSTANT, value=255)
-            self._patterns[number] = white.astype(np.float32) / 255
+            drawn = cv2.aruco.generateImageMarker(
+                self._dictionary, number, self._modules * TEXTURE
+            )
+            white = np.pad(drawn, QUIET * TEXTURE, constant_values=255)
+            self._patterns[number] = np.asarray(white / 255, dtype=np.float32)
         return self._patterns[number]
 
     def _refined(
@@ -270,6 +271,7 @@ class _Fit:
 def _gaussian(covariance: Array) -> Array:
     """A kernel of that covariance [pixels^2]."""
     reach = int(np.ceil(3 * np.sqrt(float(np.diag(covariance).max()))))
-    grid = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1][::-1], axis=-1)
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    grid = np.stack((u, v), axis=-1)
     kernel = np.exp(-0.5 * np.einsum("...i,ij,...j", grid, np.linalg.inv(covariance), grid))
     return np.asarray(kernel / kernel.sum(), dtype=np.float32)
