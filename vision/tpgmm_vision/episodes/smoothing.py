@@ -82,6 +82,10 @@ class Track:
         index = np.flatnonzero(self.seen)
         if not len(index):
             raise DataError(f"it was never seen: {self.reasons[-1]}")
+        runs = np.split(index, np.flatnonzero(np.diff(self.time[index]) > LATE) + 1)
+        for run in runs[1:]:
+            self.seen[run] = len(run) >= CARRIED_FRAMES  # fewer, alone for long, may be wrong
+        index = np.flatnonzero(self.seen)
         points, self.known = _points(self.poses[index]), self.seen.copy()
         jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
         noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
@@ -151,12 +155,17 @@ class Track:
         rows = rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
         inside = inverse(hand[rows]) @ self.poses[rows]
         points = _points(inside)
-        away = np.linalg.norm(points - np.median(points[:CARRIED_FRAMES], axis=0), axis=1)
-        count = int(np.append(away > SLIP, True).argmax())
-        moved = np.linalg.norm(_points(self.poses[rows]) - _points(self.poses[at]), axis=1)
-        if count < CARRIED_FRAMES or moved[:count].max() < CARRIED_WAY * SLIP:
+        middle = np.median(points[: 2 * ELSEWHERE + 1], axis=0)
+        away = np.linalg.norm(points - middle, axis=1) > SLIP
+        lost = np.convolve(away, np.ones(ELSEWHERE), "valid") == ELSEWHERE
+        count = int(np.append(lost, True).argmax())
+        held = np.flatnonzero(~away[:count])
+        moved = np.linalg.norm(
+            _points(self.poses[rows[held]]) - _points(self.poses[at]), axis=1
+        )
+        if len(held) < CARRIED_FRAMES or moved.max() < CARRIED_WAY * SLIP:
             return 0, np.full((4, 4), np.nan)
-        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
+        return count, mean_pose(list(inside[held[: 4 * CARRIED_FRAMES]]))[0]
 
     def _finish(self, last: int, hands: Mapping[str, Array]) -> None:
         """Fill what follows the last known row."""
