@@ -51,6 +51,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("camera", "targets", "sources"),
         ("cell",),
         ("detection",),
+        ("episodes",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
