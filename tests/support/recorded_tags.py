@@ -90,8 +90,8 @@ def record(root, episodes, *, codec="libsvtav1", images=False, seed=0):
 def carried(rows, covered=(), shift=0.0):
     """An episode in which a hand moves the tag: what is drawn, and poses of hand and tag.
 
-    In ``covered`` stretches, ``(first, last)`` rows, nothing is drawn. All is moved by ``shift``
-    along y [m].
+    In ``covered`` stretches, ``(first, last)`` rows, nothing is drawn. All is moved by
+    ``shift`` along y [m].
     """
     time = np.arange(rows) / FPS
     shares = [

