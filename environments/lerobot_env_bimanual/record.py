@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
 
 BOTTLES = {
     "bottle_shaking": Expert(
-        BottleShakingEnv,
+        partial(BottleShakingEnv, track=True),
         lambda seed: BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(1, seed)[0],
         ("bottle",),
     ),

@@ -200,7 +200,7 @@ class Rig:
         return view.pose if view.link is None else self.pose(view.link) @ view.pose
 
     def in_sight(self, camera: str, point: ArrayLike) -> bool:
-        """Whether nothing is before a point (3,) of the camera's frame but what it is on [m]."""
+        """Whether nothing hides a point (3,) of the camera's frame, but what it is on [m]."""
         self._follow()
         pose, point = self.camera_pose(camera), np.asarray(point, dtype=float)
         distance, hit = float(np.linalg.norm(point)), np.zeros(1, np.int32)
