@@ -21,10 +21,10 @@ __all__ = ["calibration_episode", "chain_of", "varied_postures"]
 
 #: Postures are drawn from the middle share of the ranges of the joints, until so many times as
 #: many as are wanted show the tags, or so many have been drawn.
-RANGE, CANDIDATES, DRAWN = 0.8, 20, 60_000
+RANGE, CANDIDATES, DRAWN = 0.8, 10, 30_000
 #: A tag is shown if its edges are this long in the picture and this far from its border
 #: [pixels], and it is turned from the camera by at most this [deg].
-EDGE, BORDER, TURNED = 14.0, 12.0, 60.0
+EDGE, BORDER, TURNED = 15.0, 12.0, 55.0
 #: Which distance between postures is as different as a turn by 1 rad [m].
 APART = 0.2
 #: How fast joints move at most on the way between postures [rad/s], how long a way takes at
@@ -106,18 +106,23 @@ def _in_camera(rig: Rig, camera: str, link: str) -> Array:
 def _shown(rig: Rig, camera: str, link: str) -> bool:
     """Whether the camera sees one of the tags of a link well, and nothing is before it."""
     pose, lens = _in_camera(rig, camera, link), rig.lens.camera
-    size = np.array((lens.width, lens.height)) - 1
-    for corners in rig.carriers[link].target.corners.values():
-        seen = transformed(pose, corners)
-        centre = seen.mean(axis=0)
-        outwards = np.cross(seen[1] - seen[0], seen[0] - seen[3])
-        turned = -outwards @ centre / np.linalg.norm(outwards) / np.linalg.norm(centre)
-        if seen[:, 2].min() <= 0 or turned < np.cos(np.radians(TURNED)):
-            continue
-        pixels = lens.project(seen)
-        edges = np.linalg.norm(pixels - np.roll(pixels, 1, axis=0), axis=1)
+    corners = np.stack([*rig.carriers[link].target.corners.values()])
+    seen = transformed(pose, corners.reshape(-1, 3)).reshape(corners.shape)
+    middle, outwards = (
+        seen.mean(axis=1),
+        np.cross(seen[:, 1] - seen[:, 0], seen[:, 0] - seen[:, 3]),
+    )
+    away = np.linalg.norm(outwards, axis=1) * np.linalg.norm(middle, axis=1)
+    towards = -(outwards * middle).sum(axis=1) / away
+    for tag in np.flatnonzero(
+        (towards > np.cos(np.radians(TURNED))) & (seen[..., 2].min(axis=1) > 0)
+    ):
+        pixels = lens.project(seen[tag])
+        size = np.array((lens.width, lens.height)) - 1
         inside = (pixels > BORDER).all() and (pixels < size - BORDER).all()
-        if inside and edges.min() > EDGE and rig.in_sight(camera, centre):
+        edges = np.linalg.norm(pixels - np.roll(pixels, 1, axis=0), axis=1)
+        points = [middle[tag], *(0.1 * middle[tag] + 0.9 * seen[tag])]
+        if inside and edges.min() > EDGE and all(rig.in_sight(camera, one) for one in points):
             return True
     return False
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
+from lerobot_env_bimanual.eyes import calibration
 from lerobot_env_bimanual.eyes.calibration import chain_of, varied_postures
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.eyes.rig import looking
@@ -48,7 +49,8 @@ def test_all_postures_show_the_tags_and_turn_the_hand_about_all_axes(env):
     assert (np.degrees([np.linalg.norm(one) for one in apart]) > 20).mean() > 0.7
 
 
-def test_a_camera_that_looks_away_is_refused(env):
+def test_a_camera_that_looks_away_is_refused(env, monkeypatch):
+    monkeypatch.setattr(calibration, "DRAWN", 200)
     away = View(looking((1.0, 0.0, 0.5), (2.0, 0.0, 0.5)))
     rig = env.rig("front", carriers=TAGS, objects={})
     rig.views = {"front": away}

@@ -14,13 +14,15 @@ TASK = "bend the elbow"
 
 
 def recorder(path, **options):
-    return Recorder(path, 10, ["elbow", "wrist"], {"front": SIZE}, {"joints": ["elbow"]}, **options)
+    return Recorder(
+        path, 10, ["elbow", "wrist"], {"front": SIZE}, {"joints": ["elbow"]}, **options
+    )
 
 
 def rows(n, grey):
     for row in range(n):
         picture = np.full((*SIZE[::-1], 3), grey + 5 * row, np.uint8)
-        yield (0.1 * row, -0.1), (0.1 * (row + 1), -0.1), {"front": picture}, TASK
+        yield (0.1 * row, -0.1 * row), (0.1 * (row + 1), -0.1), {"front": picture}, TASK
 
 
 @pytest.mark.parametrize("codec", ["av1", "h264", "pictures"])
@@ -58,7 +60,10 @@ def test_what_is_discarded_is_not_in_the_set(tmp_path):
 
 
 def test_an_error_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError, match="robot fell"), recorder(tmp_path / "set") as open_set:
+    with (
+        pytest.raises(RuntimeError, match="robot fell"),
+        recorder(tmp_path / "set") as open_set,
+    ):
         for row in rows(4, 0):
             open_set.add(*row)
         open_set.save()
@@ -77,5 +82,5 @@ def test_a_folder_that_exists_is_left_alone(tmp_path):
 
 
 def test_unknown_codecs_are_refused(tmp_path):
-    with pytest.raises(DataError, match="av1.*'gif'"):
+    with pytest.raises(DataError, match=r"av1.*'gif'"):
         recorder(tmp_path / "set", codec="gif")
