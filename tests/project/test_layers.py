@@ -36,7 +36,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
-        ("errors",),
+        ("errors", "least_squares"),
         ("names",),
         ("units", "robots"),
         ("checks",),
@@ -50,6 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("poses",),
         ("camera", "targets", "sources"),
         ("cell",),
+        ("calibration",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
