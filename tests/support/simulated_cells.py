@@ -16,7 +16,10 @@ from tpgmm_vision.targets import Target, cube
 
 CAMERA = Camera(640, 480, (554.0, 554.0), (322.5, 237.5), (0.08, -0.15, 0.0006, -0.0004, 0.0))
 HAND, BI_HANDS = "gripper_frame_link", ("left_gripper_frame_link", "right_gripper_frame_link")
-CUBE, OTHER = cube([10, 11, 12, 13, 14], 0.03), cube([20, 21, 22, 23, 24], 0.03)
+CUBE, OTHER, LARGE = (
+    cube([first + i for i in range(5)], size)
+    for first, size in ((10, 0.03), (20, 0.03), (10, 0.04))
+)
 IN_HAND = rigid(np.radians([10, 20, 30]), (0.0, 0.0, -0.05))
 
 
@@ -151,7 +154,7 @@ def upper_body_cell(offset: float, rng: np.random.Generator, **settings: Any) ->
     moving = robot.state(torch.as_tensor(middle)).jacobians[0].abs().amax(0).numpy() > 1e-9
     return SimulatedCell(
         robot, {"front": (looking((1.05, -0.35, 0.65), (0.3, -0.1, 0.2)), None)},
-        {"cube": (CUBE, rigid(np.radians([10, 20, 30]), (0.03, -0.04, 0.05)), "r_hand")},
+        {"cube": (LARGE, rigid(np.radians([10, 20, 30]), (0.03, -0.04, 0.05)), "r_hand")},
         np.radians(rng.normal(0, offset, robot.n_joints)) * moving,
         middle=middle, reach=0.6 * moving, **settings,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.calibration.adjustment import OFFSET_PRIOR, Adjustment, adjust
 from tpgmm_vision.calibration.reprojection import Corners, Integers, Reprojection
 from tpgmm_vision.cell import CellCamera
-from tpgmm_vision.detection.estimation import View, estimate_pose
+from tpgmm_vision.detection.estimation import PoseEstimate, View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
 from tpgmm_vision.poses import Array, angle_between, inverse, mean_pose, rigid
 from tpgmm_vision.targets import Target
@@ -208,30 +208,29 @@ class _Task:
         _check(robot, table, seen, cameras, mounts, bases)
         names, rows = list(seen), list[tuple[int, int, int, int]]()
         pixels, points = list[Array](), list[Array]()
-        views: dict[tuple[int, int], list[tuple[int, Array]]] = {}
+        views: dict[tuple[int, int], list[tuple[int, PoseEstimate]]] = {}
         for posture in range(len(table)):
             for i, name in enumerate(names):
                 found, camera = seen[name][posture].corners, cameras[name].camera
                 for j, mount in enumerate(mounts.values()):
                     estimate = estimate_pose([View(camera, np.eye(4), found)], mount.target)
-                    if estimate is not None and estimate.valid:
-                        views.setdefault((i, j), []).append((posture, estimate.pose))
+                    if estimate is not None:
+                        views.setdefault((i, j), []).append((posture, estimate))
                     for number in found.keys() & mount.target.corners.keys():
                         rows.append((posture, i, j, number))
                         pixels.append(found[number])
                         points.append(mount.target.corners[number])
         for i, name in enumerate(names):
-            n = len({k for (at, _), poses in views.items() if at == i for k, _ in poses})
+            n = len({k for (at, _), those in views.items() if at == i for k, _ in those})
             if n < LEAST_PICTURES:
                 raise DataError(
-                    f"camera {name!r} sees a tag well in {n} of {len(table)} pictures, "
-                    f"{LEAST_PICTURES} are needed at least: is it the camera that sees the hand, "
-                    "are the numbers of the tags right, and are these large enough in the "
-                    "picture (an edge of 20 pixels)?"
+                    f"camera {name!r} sees tags of {list(mounts)} in {n} of {len(table)} "
+                    f"pictures, {LEAST_PICTURES} are needed: is it the camera that sees them, "
+                    "are their numbers right, and are they large enough in the picture (20 "
+                    "pixels an edge)?"
                 )
-        lost = [name for j, name in enumerate(mounts) if j not in {j for _, j in views}]
-        if lost:
-            raise DataError(f"no camera sees {lost} well: are the numbers of the tags right?")
+        if lost := [name for j, name in enumerate(mounts) if j not in {j for _, j in views}]:
+            raise DataError(f"no camera sees tags of {lost}: are their numbers right?")
         corners = Corners(
             np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(rows), 4, 0).T
         )
@@ -241,10 +240,12 @@ class _Task:
         problem = Reprojection(
             robot, table, corners, [cameras[name].camera for name in names], carriers, own
         )
-        poses = {
-            pair: (np.array([k for k, _ in found]), np.array([pose for _, pose in found]))
-            for pair, found in views.items()
-        }
+        poses = {}
+        for pair, those in views.items():
+            # those that cannot be trusted only where there are no others
+            good = [one for one in those if one[1].valid]
+            good = good if len(good) >= LEAST_PICTURES else those
+            poses[pair] = np.array([k for k, _ in good]), np.array([e.pose for _, e in good])
         return cls(problem, names, list(mounts), bases, poses)
 
     def start(self) -> Array:
