@@ -45,7 +45,9 @@ def visible(camera: Camera, pose: Array, target: Target) -> dict[int, Array]:
         local = transformed(pose, points)
         middle, normal = local.mean(0), np.cross(local[1] - local[0], local[3] - local[0])
         cosine = normal @ middle / np.linalg.norm(normal) / np.linalg.norm(middle)
-        if (local[:, 2] < 0.1).any() or cosine < np.cos(np.radians(65)):
+        if (local[:, 2] < 0.12).any() or cosine < np.cos(np.radians(65)):
+            continue
+        if (np.abs(local[:, :2]) > 0.65 * local[:, 2:]).any():  # where the lens is no model
             continue
         pixels = camera.project(local)
         inside = ((pixels > 12) & (pixels < (camera.width - 12, camera.height - 12))).all()
