@@ -35,6 +35,10 @@ BLURRED = 3.0
 #: The same in both directions up to this, focal lengths are those of square pixels.
 SQUARE = 0.005
 
+#: Half a window in which a corner is refined, as a share of its distance to the next tag.
+WINDOW = 0.9
+SUBPIXEL = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-4
+
 Views = Mapping[str, tuple[Array, Array]]
 
 
@@ -129,12 +133,19 @@ def _views(
     """Points of the board and their pixels in pictures that show it, and the others."""
     drawn = board.drawn
     detector, found, without = cv2.aruco.CharucoDetector(drawn), {}, list[str]()
+    share = WINDOW * (board.square - board.marker) / 2 / board.square
     for name, picture in pictures.items():
-        corners, numbers, _, _ = detector.detectBoard(grey(picture))
+        image = grey(picture)
+        corners, numbers, _, _ = detector.detectBoard(image)
         if numbers is None or len(numbers) < LEAST_CORNERS:
             without.append(name)
             continue
-        points, pixels = drawn.matchImagePoints(corners, numbers)
+        points, _ = drawn.matchImagePoints(corners, numbers)
+        between = np.linalg.norm(corners - corners[:, 0][:, None].swapaxes(0, 1), axis=-1)
+        window = int(np.clip(between[between > 0].min() * share, 2, 10))
+        # OpenCV's board corners lie half a pixel to the right and below
+        start = np.ascontiguousarray(corners - np.float32(0.5))
+        pixels = cv2.cornerSubPix(image, start, (window, window), (-1, -1), SUBPIXEL)
         found[name] = points.reshape(-1, 3), pixels.reshape(-1, 2)
     if len(found) > MOST_PICTURES:
         found = _most_different(found)
