@@ -49,7 +49,8 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_vision": (
         ("poses",),
         ("camera", "targets", "sources"),
-        ("cell",),
+        ("cell", "printing"),
+        ("commands",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
