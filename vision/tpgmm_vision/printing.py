@@ -245,11 +245,11 @@ def _tag(axes: Any, family: str, number: int, corner: Array, size: float) -> Non
 
 
 def _face(axes: Any, entry: Any, number: int | None, corner: Array, words: str) -> None:
-    """A tag, if any, and the white around it, in the outer half of which words stand."""
+    """A tag, if any, and the white around it, at the outer edge of which words stand."""
     size, module, _ = _sizes(entry)
     if number is not None:
         family = entry.get("family", DEFAULT_FAMILY)
         _tag(axes, family, number, corner + module, size)
         words = f"{number}   {words}"
-    points = min(7.0, 0.5 * module * POINTS_PER_MM)
-    axes.text(*(corner + 0.2 * module), words, fontsize=points, color="0.5")
+    points = min(7.0, 0.4 * module * POINTS_PER_MM)
+    axes.text(*(corner + 0.1 * module), words, fontsize=points, color="0.5")
