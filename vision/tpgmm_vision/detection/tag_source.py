@@ -193,20 +193,17 @@ class TagSource:
 
     def _said(self, name: str, one: CellCamera, place: Array) -> str:
         """What is said of a camera that was moved, as far as it is seen now."""
-        for check, known in self._cell.checks.items():
+        by = ""
+        for known in self._cell.checks.values():
             seen = self.detections[name][known.target.family]
             view = View(one.camera, np.eye(4), seen.corners, seen.covariances)
-            if (found := estimate_pose([view], known.target)) is None:
-                continue
-            now = known.pose @ inverse(found.pose)
-            far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
-            by = f" by {1e3 * far:.0f} mm and {np.degrees(turn):.1f} deg"
-            break
-        else:
-            check, by = next(iter(self._cell.checks)), ""
+            if found := estimate_pose([view], known.target):
+                now = known.pose @ inverse(found.pose)
+                far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
+                by = f" by {1e3 * far:.0f} mm and {np.degrees(turn):.1f} deg"
         return (
-            f"camera {name!r} was moved{by}, or the tag of {check!r} was; put it back, or run "
-            "tpgmm calibrate cell again"
+            f"camera {name!r} was moved{by}, or a tag of the checks {list(self._cell.checks)} "
+            "was; put it back, or run tpgmm calibrate cell again"
         )
 
     def _around(
