@@ -49,9 +49,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_vision": (
         ("poses",),
         ("camera", "targets", "sources"),
-        ("cell",),
+        ("cell", "printing"),
         ("detection",),
+        ("episodes",),
         ("calibration",),
+        ("commands",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
