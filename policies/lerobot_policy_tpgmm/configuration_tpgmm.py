@@ -150,6 +150,11 @@ class TPGMMConfig(StatePolicyConfig):
         one another in ``observation.environment_state``.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
+    cell : dict or str, optional
+        The content of a cell file, to begin with its path, ``cell.json``: frames that are
+        objects of it are found in the pictures of its cameras at each step, whatever
+        ``observation.environment_state`` says. By default that of the data set, if its poses
+        were found so; ``"none"`` reads poses from the observation.
     fps : float, optional
         Steps per second of the demonstrations.
     control_fps : float, optional
@@ -187,6 +192,7 @@ class TPGMMConfig(StatePolicyConfig):
     units: dict[str, list[float] | str] | str | None = None
     frames: dict[str, list[int | str]] | None = None
     default_environment_state: list[float] | None = None
+    cell: dict[str, Any] | str | None = None
     fps: float | None = None
     control_fps: float | None = None
     chunk_size: int = 50

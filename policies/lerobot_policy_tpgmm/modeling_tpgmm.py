@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -33,11 +34,12 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import consistent, recover
+from tpgmm_torch.atomic import consistent, read_whole, recover
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
+    DependencyError,
     ModelFileError,
     NotFittedError,
     PlausibilityWarning,
@@ -64,6 +66,8 @@ lerobot-rollout --policy.path={repo_id} --strategy.type=base
 ```"""
 #: When an observation was made [s], of environments and robots that tell.
 TIMESTAMP = "observation.timestamp"
+#: In place of a cell: poses are those that are observed.
+NO_CELL = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +185,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(seen, config.frames, *named, default, width)
+        self.eyes = self._eyes()
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -212,6 +217,54 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         for operator in operators:
             operator.check(kinematics, known - set(kinematics.links))
         return kinematics, operators
+
+    def _eyes(self) -> Any:
+        """What finds frames in pictures, if the policy has a cell, whose content it keeps."""
+        config, features = self.config, self.config.input_features
+        config.input_features = {
+            key: one for key, one in features.items() if one.type is not FeatureType.VISUAL
+        }
+        if config.cell in (None, NO_CELL):
+            return None
+        try:
+            from lerobot_policy_tpgmm.eyes import Eyes, cell_of
+        except ImportError as error:
+            raise DependencyError(
+                "a policy with a cell needs OpenCV: pip install 'tpgmm-torch[vision]'"
+            ) from error
+        cell = cell_of(config.cell)
+        eyes = Eyes(cell, self.kinematics, self.frames.frame_names)
+        elsewhere = {*eyes.names, *self.frames.in_state}
+        missing = [name for name in self.frames.frame_names if name not in elsewhere]
+        if missing and self.frames.default is None:
+            raise DataError(
+                f"the policy needs the poses of {missing}, and the cell has the objects "
+                f"{list(cell.objects)}: add what is missing, or take poses that are "
+                f"observed otherwise, --policy.cell={NO_CELL}"
+            )
+        config.cell = dict(cell.content)
+        config.input_features |= eyes.features
+        return eyes
+
+    def _recalibrate(self, learned: Any) -> None:
+        """Say what differs from the cell that the policy was learned with, and take it over."""
+        cell = self.config.cell
+        if self.eyes is None or cell is None or learned == cell:
+            return
+        from lerobot_policy_tpgmm.eyes import cell_of, differences, shifted
+
+        before = cell_of({} if learned in (None, NO_CELL) else learned)
+        now = cell_of(cell)
+        if learned not in (None, NO_CELL) and (told := differences(before, now)):
+            log.warning(
+                "the policy was learned with another cell: %s. Errors of that calibration are "
+                "part of what was learned, so track and learn again if it misses",
+                "; ".join(told),
+            )
+        if shifts := self.joints.shift(shifted(before, now)):
+            units = self.config.units or {}
+            given = {"*": units} if isinstance(units, str) else units
+            self.config.units = {**given, **shifts}
 
     @staticmethod
     def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
@@ -388,7 +441,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
         self._chunk: Chunk | None = None
-        self._ticks, self._statuses = TickDurations(), dict[int, Status]()
+        self._ticks, self._statuses = TickDurations(), dict[int, Any]()
+        self._stand: Tensor | None = None
+        if self.eyes is not None:
+            self.eyes.reset()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -400,7 +456,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``observation.state`` (B, n_state) and what the frames are read from; in the middle
             of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
             much time has passed [s], where it is there; what a tick comes late is caught up by
-            those that follow.
+            those that follow. With a cell the pictures of its cameras, (B, 3, height, width);
+            the robots stand where they are until all objects were seen.
 
         Returns
         -------
@@ -412,8 +469,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError, ShapeError
             If the observation is not what the policy was made for.
         """
+        self._look(batch, 1 / self.config.rate)
         if self._controller is None:
             self._controller = self._begin(batch)
+        if self._controller is None:
+            return self.joints.action(self._standing)
         return self.joints.action(self._step(self._controller, batch))
 
     @torch.no_grad()
@@ -443,6 +503,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         now = batch.get(TIMESTAMP)
         timestamp, last = None if now is None else float(now.flatten()[0]), self._chunk
+        self._look(batch, None if self._controller is None else 0.0)
+        ahead: Controller | None
         if self._controller is not None:  # select_action says how far the episode is
             ahead = self._controller.copy()
         elif last is None:
@@ -453,10 +515,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ahead = last.first.resumed(
                 last.moments[passed], passed / self.config.rate, measured, poses
             )
+        if ahead is None:
+            standing = self.joints.action(self._standing)
+            return standing.unsqueeze(1).repeat(1, self.config.chunk_size, 1)
         references = [self._step(ahead, batch, 1 / self.config.rate)]
-        moments, first, ahead = [ahead], ahead, ahead.ahead()
+        moments, first, ages = [ahead], ahead, self._ages(ahead)
+        ahead = ahead.copy() if ages else ahead.ahead()
         while len(references) < self.config.chunk_size:
-            ahead.step(1 / self.config.rate)
+            ahead.step(1 / self.config.rate, ages=ages)
             references.append(ahead.reference.reshape(references[0].shape))
             moments.append(ahead.copy())
         joints = torch.stack(references, dim=1)
@@ -469,9 +535,36 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
         return True
 
-    def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
+    def _look(self, batch: Mapping[str, Tensor], passed: float | None) -> None:
+        """Find the frames in the pictures, if there is a cell and the frames are read now."""
+        begun = self._controller is not None or self._chunk is not None
+        if self.eyes is not None and (self.config.control.follow_frames or not begun):
+            self.eyes.look(batch, self._observed(batch), passed, batch.get(TIMESTAMP))
+
+    def _ages(self, controller: Controller) -> dict[str, Any]:
+        """What keeps robots from moving, as ages for a controller."""
+        ages = {} if self.eyes is None else self.eyes.ages()
+        single = controller.reference.ndim == 1
+        return {what: age[0] if single else age for what, age in ages.items()}
+
+    @property
+    def _standing(self) -> Tensor:
+        """Postures (B, n_joints) of robots that wait for the beginning."""
+        assert self._stand is not None
+        return self._stand
+
+    def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
+        """A running skill, None while objects are looked for."""
         check_rate(batch, self.config.rate)
-        joints, frames = self._observed(batch), self.frames.frames(batch)
+        found, joints = {}, self._observed(batch)
+        if self.eyes is not None:
+            if self._stand is None:
+                self._stand = self.kinematics.joint_tensor(joints)
+            joints, seen = self._stand, self.eyes.first()
+            if seen is None:
+                return None
+            found = seen
+        frames = self.frames.frames(batch, found)
         if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return Controller(self.skill, joints, frames, **self.config.control.options())
@@ -488,7 +581,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "call reset() between episodes"
             )
         first = controller.command is None
-        poses = self.frames.poses(batch) if config.control.follow_frames and not first else {}
+        found = {} if self.eyes is None else self.eyes.poses()
+        follows = config.control.follow_frames and not first
+        poses = self.frames.poses(batch, found) if follows else {}
         if len(shape) == 1:
             measured = measured[0]
             poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
@@ -501,7 +596,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         start, first = controller.reference, controller.command is None
         measured = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
-        command = controller.step(float(passed) if start.ndim == 1 else passed, *measured)
+        passed = float(passed) if start.ndim == 1 else passed
+        command = controller.step(passed, *measured, ages=self._ages(controller))
         if first:
             self._check_start(start, command.estimate.joints)
         self._log(command)
@@ -512,11 +608,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         several = command.codes.ndim > 0
         times = command.time.expand(command.codes.shape).flatten().tolist()
         for robot, status in enumerate(command.status if several else [command.status]):
-            if status != self._statuses.get(robot, Status.RUNNING):
-                reason = command.reason(robot if several else ())
-                what = f"{status}: {reason}" if reason else status
+            unseen = {} if self.eyes is None else self.eyes.unseen(robot)
+            told = status, tuple(unseen)
+            if told != self._statuses.get(robot, (Status.RUNNING, ())):
+                reasons = filter(
+                    None, (command.reason(robot if several else ()), *unseen.values())
+                )
+                what = ": ".join(filter(None, (status, "; ".join(reasons))))
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
-            self._statuses[robot] = status
+            self._statuses[robot] = told
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
         """Seconds for which the next reference is."""
@@ -664,6 +764,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ),
             )
             policy = cls(config, model=model, **options).eval().to(config.device)
+            policy._recalibrate(json.loads(read_whole(folder / CONFIG_NAME)).get("cell"))
             validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:
             raise

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -34,6 +35,7 @@ REMEDY = (
     "--policy.state_names='[...]' --policy.action_names='[...]'"
 )
 POSE = 7
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 #: Key of the rate in an observation [1/s].
 CONTROL_RATE = "observation.control_fps"
 
@@ -124,6 +126,25 @@ class JointFeatures(nn.Module):
             )
         return state[:, self.columns] * self.scale[:, 0] + self.scale[:, 1]
 
+    def shift(self, offsets: Mapping[str, float]) -> dict[str, list[float] | str]:
+        """Add offsets [rad] to what joints are measured to be.
+
+        Returns
+        -------
+        dict of str to [factor, offset]
+            The units of their entries from now on.
+        """
+        units: dict[str, list[float] | str] = {}
+        for place, name in enumerate(self.joint_names):
+            if name in offsets:
+                column = int((self.order == place).nonzero()[0])
+                self.scale[place, 1] += offsets[name]
+                self.back[column, 1] += offsets[name]
+                entry = self.state_names[int(self.columns[place])]
+                units[entry] = self.scale[place].tolist()
+                units[self.action_names[column]] = self.back[column].tolist()
+        return units
+
     def action(self, joints: Tensor) -> Tensor:
         """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
         ordered = joints[..., self.order]
@@ -201,13 +222,17 @@ class FrameFeatures:
                     f"{OBS_ENV_STATE} has {self.n_environment}"
                 )
 
-    def frames(self, batch: Mapping[str, Any]) -> dict[str, Frame]:
+    def frames(
+        self, batch: Mapping[str, Any], found: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Frame]:
         """Poses (B,) of all frames.
 
         Parameters
         ----------
         batch : mapping of str to Tensor
             Observations.
+        found : mapping of str to Tensor of shape (B, 7), optional
+            Poses that count in place of those that are observed.
 
         Raises
         ------
@@ -221,7 +246,10 @@ class FrameFeatures:
                 f"{OBS_ENV_STATE} has shape ({len(state)}, {self.n_environment}), got "
                 f"{tuple(environment.shape)}: is this policy for another environment?"
             )
-        poses = {name: self._pose(name, state, environment) for name in self.frame_names}
+        poses = {
+            name: found[name] if name in found else self._pose(name, state, environment)
+            for name in self.frame_names
+        }
         frames = {}
         for name, pose in poses.items():
             try:
@@ -230,11 +258,13 @@ class FrameFeatures:
                 raise DataError(f"frame {name!r}: {error}") from error
         return frames
 
-    def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
+    def poses(
+        self, batch: Mapping[str, Any], found: Mapping[str, Tensor] = NOTHING
+    ) -> dict[str, Tensor | None]:
         """The same in the middle of an episode: (B, 7), of any values; None for a lost one."""
         state, environment = batch[OBS_STATE], batch.get(OBS_ENV_STATE)
-        poses: dict[str, Tensor | None] = {}
-        for name in self.frame_names:
+        poses: dict[str, Tensor | None] = dict(found)
+        for name in (name for name in self.frame_names if name not in found):
             try:
                 poses[name] = self._pose(name, state, environment)
             except (DataError, IndexError):
