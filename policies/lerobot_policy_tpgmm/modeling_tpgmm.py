@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ import torch
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
@@ -34,12 +33,11 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import consistent, read_whole, recover
+from tpgmm_torch.atomic import consistent, recover
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
-    DependencyError,
     ModelFileError,
     NotFittedError,
     PlausibilityWarning,
@@ -185,7 +183,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(seen, config.frames, *named, default, width)
-        self.eyes = self._eyes()
+        self.watch = self._watch()
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -218,53 +216,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             operator.check(kinematics, known - set(kinematics.links))
         return kinematics, operators
 
-    def _eyes(self) -> Any:
-        """What finds frames in pictures, if the policy has a cell, whose content it keeps."""
-        config, features = self.config, self.config.input_features
-        config.input_features = {
-            key: one for key, one in features.items() if one.type is not FeatureType.VISUAL
-        }
+    def _watch(self) -> Any:
+        """What finds frames in pictures, if the policy has a cell."""
+        config, inputs = self.config, self.config.input_features.items()
+        config.input_features = {k: v for k, v in inputs if v.type is not FeatureType.VISUAL}
         if config.cell in (None, NO_CELL):
             return None
-        try:
-            from lerobot_policy_tpgmm.eyes import Eyes, cell_of
-        except ImportError as error:
-            raise DependencyError(
-                "a policy with a cell needs OpenCV: pip install 'tpgmm-torch[vision]'"
-            ) from error
-        cell = cell_of(config.cell)
-        eyes = Eyes(cell, self.kinematics, self.frames.frame_names)
-        elsewhere = {*eyes.names, *self.frames.in_state}
-        missing = [name for name in self.frames.frame_names if name not in elsewhere]
-        if missing and self.frames.default is None:
-            raise DataError(
-                f"the policy needs the poses of {missing}, and the cell has the objects "
-                f"{list(cell.objects)}: add what is missing, or take poses that are "
-                f"observed otherwise, --policy.cell={NO_CELL}"
-            )
-        config.cell = dict(cell.content)
-        config.input_features |= eyes.features
-        return eyes
+        from lerobot_policy_tpgmm.eyes import open_eyes
 
-    def _recalibrate(self, learned: Any) -> None:
-        """Say what differs from the cell that the policy was learned with, and take it over."""
-        cell = self.config.cell
-        if self.eyes is None or cell is None or learned == cell:
-            return
-        from lerobot_policy_tpgmm.eyes import cell_of, differences, shifted
-
-        before = cell_of({} if learned in (None, NO_CELL) else learned)
-        now = cell_of(cell)
-        if learned not in (None, NO_CELL) and (told := differences(before, now)):
-            log.warning(
-                "the policy was learned with another cell: %s. Errors of that calibration are "
-                "part of what was learned, so track and learn again if it misses",
-                "; ".join(told),
-            )
-        if shifts := self.joints.shift(shifted(before, now)):
-            units = self.config.units or {}
-            given = {"*": units} if isinstance(units, str) else units
-            self.config.units = {**given, **shifts}
+        return open_eyes(config, self.kinematics, self.frames)
 
     @staticmethod
     def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
@@ -441,10 +401,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
         self._chunk: Chunk | None = None
-        self._ticks, self._statuses = TickDurations(), dict[int, Any]()
-        self._stand: Tensor | None = None
-        if self.eyes is not None:
-            self.eyes.reset()
+        self._ticks, self._statuses = TickDurations(), dict[int, list[str]]()
+        self._stand: Any = None
+        if self.watch is not None:
+            self.watch.reset()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -456,8 +416,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``observation.state`` (B, n_state) and what the frames are read from; in the middle
             of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
             much time has passed [s], where it is there; what a tick comes late is caught up by
-            those that follow. With a cell the pictures of its cameras, (B, 3, height, width);
-            the robots stand where they are until all objects were seen.
+            those that follow. With a cell, the pictures of its cameras (B, 3, height, width) in
+            [0, 1]: robots stand until all objects were seen.
 
         Returns
         -------
@@ -469,11 +429,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError, ShapeError
             If the observation is not what the policy was made for.
         """
-        self._look(batch, 1 / self.config.rate)
+        batch = self._seen(batch, 1 / self.config.rate)
         if self._controller is None:
             self._controller = self._begin(batch)
         if self._controller is None:
-            return self.joints.action(self._standing)
+            return self.joints.action(self._stand)
         return self.joints.action(self._step(self._controller, batch))
 
     @torch.no_grad()
@@ -503,8 +463,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         now = batch.get(TIMESTAMP)
         timestamp, last = None if now is None else float(now.flatten()[0]), self._chunk
-        self._look(batch, None if self._controller is None else 0.0)
-        ahead: Controller | None
+        batch, ahead = self._seen(batch, None if self._controller is None else 0.0), None
         if self._controller is not None:  # select_action says how far the episode is
             ahead = self._controller.copy()
         elif last is None:
@@ -516,8 +475,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 last.moments[passed], passed / self.config.rate, measured, poses
             )
         if ahead is None:
-            standing = self.joints.action(self._standing)
-            return standing.unsqueeze(1).repeat(1, self.config.chunk_size, 1)
+            return self.joints.action(self._stand)[:, None].repeat(1, self.config.chunk_size, 1)
         references = [self._step(ahead, batch, 1 / self.config.rate)]
         moments, first, ages = [ahead], ahead, self._ages(ahead)
         ahead = ahead.copy() if ages else ahead.ahead()
@@ -535,36 +493,37 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
         return True
 
-    def _look(self, batch: Mapping[str, Tensor], passed: float | None) -> None:
-        """Find the frames in the pictures, if there is a cell and the frames are read now."""
-        begun = self._controller is not None or self._chunk is not None
-        if self.eyes is not None and (self.config.control.follow_frames or not begun):
-            self.eyes.look(batch, self._observed(batch), passed, batch.get(TIMESTAMP))
+    def _seen(self, batch: dict[str, Tensor], passed: float | None) -> dict[str, Tensor]:
+        """An observation with the poses that are seen in its pictures, if there is a cell."""
+        first = self._controller is None and self._chunk is None
+        if self.watch is None or not (first or self.config.control.follow_frames):
+            return batch
+        images = {
+            key: batch[key].numpy(force=True) for key in batch if key.startswith(OBS_IMAGES)
+        }
+        now, joints = batch.get(TIMESTAMP), self._observed(batch).numpy(force=True)
+        times = None if now is None else now.flatten().numpy(force=True)
+        self.watch.look(images, joints, passed, times)
+        found = self.watch.first() if first else self.watch.poses()
+        return self.frames.with_poses(batch, found)
 
     def _ages(self, controller: Controller) -> dict[str, Any]:
-        """What keeps robots from moving, as ages for a controller."""
-        ages = {} if self.eyes is None else self.eyes.ages()
-        single = controller.reference.ndim == 1
-        return {what: age[0] if single else age for what, age in ages.items()}
-
-    @property
-    def _standing(self) -> Tensor:
-        """Postures (B, n_joints) of robots that wait for the beginning."""
-        assert self._stand is not None
-        return self._stand
+        """What keeps robots from moving."""
+        ages = {} if self.watch is None else self.watch.ages()
+        return {n: age[0] if controller.reference.ndim == 1 else age for n, age in ages.items()}
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
-        """A running skill, None while objects are looked for."""
+        """A running skill; None while robots stand because not all objects were seen."""
         check_rate(batch, self.config.rate)
-        found, joints = {}, self._observed(batch)
-        if self.eyes is not None:
-            if self._stand is None:
-                self._stand = self.kinematics.joint_tensor(joints)
-            joints, seen = self._stand, self.eyes.first()
-            if seen is None:
+        joints = self._observed(batch)
+        if self.watch is not None:
+            self._stand = joints = joints if self._stand is None else self._stand
+            if missing := self.watch.missing():
+                if missing != self._statuses.get(-1):
+                    log.info("%s before the start: %s", Status.HOLDING, "; ".join(missing))
+                self._statuses[-1] = missing
                 return None
-            found = seen
-        frames = self.frames.frames(batch, found)
+        frames = self.frames.frames(batch)
         if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return Controller(self.skill, joints, frames, **self.config.control.options())
@@ -581,9 +540,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "call reset() between episodes"
             )
         first = controller.command is None
-        found = {} if self.eyes is None else self.eyes.poses()
-        follows = config.control.follow_frames and not first
-        poses = self.frames.poses(batch, found) if follows else {}
+        poses = self.frames.poses(batch) if config.control.follow_frames and not first else {}
         if len(shape) == 1:
             measured = measured[0]
             poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
@@ -608,13 +565,13 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         several = command.codes.ndim > 0
         times = command.time.expand(command.codes.shape).flatten().tolist()
         for robot, status in enumerate(command.status if several else [command.status]):
-            unseen = {} if self.eyes is None else self.eyes.unseen(robot)
-            told = status, tuple(unseen)
-            if told != self._statuses.get(robot, (Status.RUNNING, ())):
-                reasons = filter(
-                    None, (command.reason(robot if several else ()), *unseen.values())
-                )
-                what = ": ".join(filter(None, (status, "; ".join(reasons))))
+            reason, told = command.reason(robot if several else ()), [str(status)]
+            if self.watch is not None:
+                unseen = self.watch.unseen(robot)
+                reason = "; ".join(filter(None, (reason, *unseen.values())))
+                told += filter(None, (self.watch.problems[robot], *unseen))
+            if told != self._statuses.get(robot, [Status.RUNNING]):
+                what = f"{status}: {reason}" if reason else status
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
             self._statuses[robot] = told
 
@@ -764,7 +721,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ),
             )
             policy = cls(config, model=model, **options).eval().to(config.device)
-            policy._recalibrate(json.loads(read_whole(folder / CONFIG_NAME)).get("cell"))
+            if policy.watch is not None:
+                from lerobot_policy_tpgmm.eyes import recalibrate
+
+                recalibrate(config, policy.joints, folder / CONFIG_NAME)
             validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:
             raise

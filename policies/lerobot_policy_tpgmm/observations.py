@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -35,7 +34,6 @@ REMEDY = (
     "--policy.state_names='[...]' --policy.action_names='[...]'"
 )
 POSE = 7
-NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 #: Key of the rate in an observation [1/s].
 CONTROL_RATE = "observation.control_fps"
 
@@ -127,23 +125,14 @@ class JointFeatures(nn.Module):
         return state[:, self.columns] * self.scale[:, 0] + self.scale[:, 1]
 
     def shift(self, offsets: Mapping[str, float]) -> dict[str, list[float] | str]:
-        """Add offsets [rad] to what joints are measured to be.
-
-        Returns
-        -------
-        dict of str to [factor, offset]
-            The units of their entries from now on.
-        """
-        units: dict[str, list[float] | str] = {}
-        for place, name in enumerate(self.joint_names):
-            if name in offsets:
-                column = int((self.order == place).nonzero()[0])
-                self.scale[place, 1] += offsets[name]
-                self.back[column, 1] += offsets[name]
-                entry = self.state_names[int(self.columns[place])]
-                units[entry] = self.scale[place].tolist()
-                units[self.action_names[column]] = self.back[column].tolist()
-        return units
+        """Add offsets [rad] to measured joints; the units of their entries from then on."""
+        more = [offsets.get(name, 0.0) for name in self.joint_names]
+        self.scale[:, 1] += self.scale.new_tensor(more)
+        self.back[:, 1] += self.scale.new_tensor(more)[self.order]
+        entries = [(self.state_names[i], self.scale[j]) for j, i in enumerate(self.columns)]
+        entries += zip(self.action_names, self.back, strict=True)
+        moved = [*more, *(more[i] for i in self.order)]
+        return {n: u.tolist() for (n, u), m in zip(entries, moved, strict=True) if m}
 
     def action(self, joints: Tensor) -> Tensor:
         """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
@@ -222,17 +211,13 @@ class FrameFeatures:
                     f"{OBS_ENV_STATE} has {self.n_environment}"
                 )
 
-    def frames(
-        self, batch: Mapping[str, Any], found: Mapping[str, Tensor] = NOTHING
-    ) -> dict[str, Frame]:
+    def frames(self, batch: Mapping[str, Any]) -> dict[str, Frame]:
         """Poses (B,) of all frames.
 
         Parameters
         ----------
         batch : mapping of str to Tensor
             Observations.
-        found : mapping of str to Tensor of shape (B, 7), optional
-            Poses that count in place of those that are observed.
 
         Raises
         ------
@@ -246,10 +231,7 @@ class FrameFeatures:
                 f"{OBS_ENV_STATE} has shape ({len(state)}, {self.n_environment}), got "
                 f"{tuple(environment.shape)}: is this policy for another environment?"
             )
-        poses = {
-            name: found[name] if name in found else self._pose(name, state, environment)
-            for name in self.frame_names
-        }
+        poses = {name: self._pose(name, state, environment) for name in self.frame_names}
         frames = {}
         for name, pose in poses.items():
             try:
@@ -258,13 +240,21 @@ class FrameFeatures:
                 raise DataError(f"frame {name!r}: {error}") from error
         return frames
 
-    def poses(
-        self, batch: Mapping[str, Any], found: Mapping[str, Tensor] = NOTHING
-    ) -> dict[str, Tensor | None]:
+    def with_poses(self, batch: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+        """An observation in which frames are at poses (B, 7) that were ``found``."""
+        rows = len(batch[OBS_STATE])
+        environment = torch.full((rows, self.n_environment), math.nan, dtype=torch.float64)
+        if self.default is not None:
+            environment[:] = self.default
+        for name, poses in found.items():
+            environment[:, self.in_environment[name]] = torch.from_numpy(poses)
+        return {**batch, OBS_ENV_STATE: environment.to(batch[OBS_STATE].device)}
+
+    def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
         """The same in the middle of an episode: (B, 7), of any values; None for a lost one."""
         state, environment = batch[OBS_STATE], batch.get(OBS_ENV_STATE)
-        poses: dict[str, Tensor | None] = dict(found)
-        for name in (name for name in self.frame_names if name not in found):
+        poses: dict[str, Tensor | None] = {}
+        for name in self.frame_names:
             try:
                 poses[name] = self._pose(name, state, environment)
             except (DataError, IndexError):
