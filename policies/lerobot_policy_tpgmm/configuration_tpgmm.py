@@ -37,6 +37,9 @@ OLD = (
     "tpgmm fit --format lerobot"
 )
 
+#: In place of a cell: its cameras are not used.
+NO_CELL = "none"
+
 
 @dataclass
 class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
@@ -151,10 +154,10 @@ class TPGMMConfig(StatePolicyConfig):
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
     cell : dict or str, optional
-        The content of a cell file, to begin with its path, ``cell.json``: frames that are
-        objects of it are found in the pictures of its cameras at each step, whatever
-        ``observation.environment_state`` says. By default that of the data set, if its poses
-        were found so; ``"none"`` reads poses from the observation.
+        The content of a cell file, to begin with its path, ``cell.json``. Frames are found in
+        the pictures of its cameras at each step, whatever ``observation.environment_state``
+        says, and joints are measured with its offsets. By default that of the data set, if it
+        was tracked; ``"none"`` reads poses from the observation.
     fps : float, optional
         Steps per second of the demonstrations.
     control_fps : float, optional

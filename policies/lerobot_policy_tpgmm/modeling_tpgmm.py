@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
-from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
+from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig, state_features
+from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, declared
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
@@ -33,7 +34,7 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import consistent, recover
+from tpgmm_torch.atomic import consistent, read_whole, recover
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
@@ -64,8 +65,6 @@ lerobot-rollout --policy.path={repo_id} --strategy.type=base
 ```"""
 #: When an observation was made [s], of environments and robots that tell.
 TIMESTAMP = "observation.timestamp"
-#: In place of a cell: poses are those that are observed.
-NO_CELL = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +161,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             kinematics, operators = skill.kinematics, getattr(model, "operators_", ())
             required = (*skill.frame_names, *frame_names(config.via_operators(), kinematics))
         config.validate_features()
+        cell = self._cell()
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
         self._make_mixture(operators, model)
         names = self.kinematics.joint_names
@@ -172,8 +172,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._check_size("state_names", state_names, config.robot_state_feature)
         action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
+        offsets = {} if cell is None else cell.joint_offsets
+        if dataset_meta is not None:
+            offsets = declared(config, dataset_meta.features, "offsets")
         every = state_names, action_names, config.units
-        self.joints = JointFeatures(names, *every, self.kinematics)
+        self.joints = JointFeatures(names, *every, self.kinematics, offsets)
         if dataset_meta is not None and isinstance(self.kinematics, Robot):
             self.kinematics = self.kinematics.unlimited(self.joints.raw)
         environment = config.env_state_feature
@@ -183,7 +186,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(seen, config.frames, *named, default, width)
-        self.watch = self._watch()
+        self.watch: Any = None
+        if cell is not None:
+            from lerobot_policy_tpgmm.eyes import watch
+
+            self.watch = watch(cell, self.kinematics, self.frames)
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -216,15 +223,18 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             operator.check(kinematics, known - set(kinematics.links))
         return kinematics, operators
 
-    def _watch(self) -> Any:
-        """What finds frames in pictures, if the policy has a cell."""
+    def _cell(self) -> Any:
+        """The cell, if there is one; its content, and the pictures it needs, are kept."""
         config, inputs = self.config, self.config.input_features.items()
         config.input_features = {k: v for k, v in inputs if v.type is not FeatureType.VISUAL}
         if config.cell in (None, NO_CELL):
             return None
-        from lerobot_policy_tpgmm.eyes import open_eyes
+        from lerobot_policy_tpgmm.eyes import cell_of, image_features
 
-        return open_eyes(config, self.kinematics, self.frames)
+        cell = cell_of(config.cell or {})
+        config.cell = dict(cell.content)
+        config.input_features |= image_features(cell)
+        return cell
 
     @staticmethod
     def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
@@ -720,11 +730,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                     config or PreTrainedConfig.from_pretrained(folder, **options),
                 ),
             )
-            policy = cls(config, model=model, **options).eval().to(config.device)
-            if policy.watch is not None:
-                from lerobot_policy_tpgmm.eyes import recalibrate
+            if learned := json.loads(read_whole(folder / CONFIG_NAME)).get("cell"):
+                from lerobot_policy_tpgmm.eyes import take_over
 
-                recalibrate(config, policy.joints, folder / CONFIG_NAME)
+                config.cell = take_over(config.cell or NO_CELL, learned)
+            policy = cls(config, model=model, **options).eval().to(config.device)
             validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:
             raise

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -53,6 +54,8 @@ class JointFeatures(nn.Module):
         As in :class:`TPGMMConfig`; by the name of an entry or of a joint.
     robot : Kinematics, optional
         Whose limits grippers in LeRobot's units have.
+    offsets : mapping of str to float, optional
+        What is added to values in radians to be joints of the robot's description [rad].
 
     Attributes
     ----------
@@ -77,6 +80,7 @@ class JointFeatures(nn.Module):
         action_names: Sequence[str],
         units: Mapping[str, Sequence[float] | str] | str | None,
         robot: Kinematics | None = None,
+        offsets: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         super().__init__()
         self.joint_names = tuple(joint_names)
@@ -98,6 +102,8 @@ class JointFeatures(nn.Module):
         chosen = units_of(_scales(units), every, called, robot, OBS_STATE)
         self.raw = {name for name, unit in zip(called, chosen, strict=True) if unit == "raw"}
         scales = [as_scale(unit, name) for name, unit in zip(every, chosen, strict=True)]
+        added = [offsets.get(n, offsets.get(m, 0)) for n, m in zip(called, every, strict=True)]
+        scales = [Scale(s.factor, s.offset + x) for s, x in zip(scales, added, strict=True)]
         state = [scales[every.index(entry[joint])] for joint in joint_names]
         action = scales[len(state_names) :]
         buffers = {
@@ -123,16 +129,6 @@ class JointFeatures(nn.Module):
                 f"{list(self.state_names)}, got {tuple(state.shape)}. {REMEDY}"
             )
         return state[:, self.columns] * self.scale[:, 0] + self.scale[:, 1]
-
-    def shift(self, offsets: Mapping[str, float]) -> dict[str, list[float] | str]:
-        """Add offsets [rad] to measured joints; the units of their entries from then on."""
-        more = [offsets.get(name, 0.0) for name in self.joint_names]
-        self.scale[:, 1] += self.scale.new_tensor(more)
-        self.back[:, 1] += self.scale.new_tensor(more)[self.order]
-        entries = [(self.state_names[i], self.scale[j]) for j, i in enumerate(self.columns)]
-        entries += zip(self.action_names, self.back, strict=True)
-        moved = [*more, *(more[i] for i in self.order)]
-        return {n: u.tolist() for (n, u), m in zip(entries, moved, strict=True) if m}
 
     def action(self, joints: Tensor) -> Tensor:
         """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
