@@ -50,6 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("poses",),
         ("camera", "targets", "sources"),
         ("cell",),
+        ("detection",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),

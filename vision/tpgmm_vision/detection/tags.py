@@ -23,9 +23,9 @@ __all__ = ["Detections", "TagDetector", "grey"]
 #: Pixels of the pattern on a side of a module, and white modules around its square.
 TEXTURE, QUIET = 8, 1
 #: What is compared reaches this far beyond the black square [modules].
-MARGIN = 0.6
-#: Blur of a camera, standard deviation [pixels].
-BLUR = 0.7
+MARGIN = 0.35
+#: Blur of a picture: the variance that a fit begins with, the least and the most [pixels^2].
+BLUR, LEAST_BLUR, MOST_BLUR = 0.5, 0.1, 6.0
 #: Steps of Gauss-Newton, and a step of all corners that ends it [pixels].
 STEPS, SMALL_STEP = 8, 0.003
 #: A fit is refused that moves a corner further than this [share of an edge], or explains less
@@ -116,7 +116,7 @@ class TagDetector:
             if min(part.shape, default=0) < self._modules:
                 continue
             for number, corners in self._rough(part):
-                corners = corners + (left, top)
+                corners += np.array([left, top])
                 if number in rough and np.abs(rough[number] - corners).max() > 2:
                     twice.add(number)
                 rough.setdefault(number, corners)
@@ -182,6 +182,7 @@ class _Fit:
         self.centre = np.array([width - 1, height - 1]) / 2
         self.scale = max(width, height) / 2
         v, u = np.mgrid[:height, :width]
+        self.blur = BLUR * np.eye(2)
         self.x, self.y = (u - self.centre[0]) / self.scale, (v - self.centre[1]) / self.scale
 
     def predicted(self, corners: Array) -> NDArray[np.float32]:
@@ -196,7 +197,7 @@ class _Fit:
         )  # fmt: skip
         if fine > 1:
             seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.GaussianBlur(seen, (0, 0), BLUR))
+        return np.asarray(cv2.filter2D(seen, -1, _gaussian(self.blur)))
 
     def run(self, corners: Array) -> tuple[Array, Array] | None:
         """Gauss-Newton on a projective motion of the corners and on the light."""
@@ -217,15 +218,22 @@ class _Fit:
             values = self.patch[inside]
             shades, *_ = np.linalg.lstsq(light, values, rcond=None)
             contrast = shades[0] + shades[1] * u + shades[2] * v
+            bends = [
+                cv2.Sobel(seen, cv2.CV_32F, *order, scale=1 / 4)[inside] * contrast
+                for order in ((2, 0), (1, 1), (0, 2))
+            ]
             gx, gy = -gx * contrast * self.scale, -gy * contrast * self.scale
             moves = np.stack(
                 (gx * u, gx * v, gx, gy * u, gy * v, gy, -(gx * u + gy * v) * u,
                  -(gx * u + gy * v) * v), axis=1,
             )  # fmt: skip
-            system = np.concatenate((moves, light), axis=1)
+            # a blur's covariance changes a picture by half its second derivatives
+            blurs = np.stack((bends[0] / 2, bends[1], bends[2] / 2), axis=1)
+            system = np.concatenate((moves, blurs, light), axis=1)
             residual = values - light @ shades
             step, *_ = np.linalg.lstsq(system, residual, rcond=None)
             corners, moved = self._moved(corners, step[:8])
+            self._blurred(step[8:11])
             if moved < SMALL_STEP:
                 break
         left = residual - system @ step
@@ -244,6 +252,12 @@ class _Fit:
         new = points[:, :2] / points[:, 2:] * self.scale + self.centre
         return new, float(np.abs(new - corners).max())
 
+    def _blurred(self, step: Array) -> None:
+        """Change the blur, within what a picture may have."""
+        new = self.blur + step[[0, 1, 1, 2]].reshape(2, 2)
+        values, axes = np.linalg.eigh(new)
+        self.blur = axes * np.clip(values, LEAST_BLUR, MOST_BLUR) @ axes.T
+
     def _rates(self, corners: Array) -> Array:
         """How corners move with the motion (8, 8)."""
         (u, v), zero, one = ((corners - self.centre) / self.scale).T, np.zeros(4), np.ones(4)
@@ -251,3 +265,11 @@ class _Fit:
         rows[:, 0] = np.stack((u, v, one, zero, zero, zero, -u * u, -u * v), axis=1)
         rows[:, 1] = np.stack((zero, zero, zero, u, v, one, -u * v, -v * v), axis=1)
         return self.scale * rows.reshape(8, 8)
+
+
+def _gaussian(covariance: Array) -> Array:
+    """A kernel of that covariance [pixels^2]."""
+    reach = int(np.ceil(3 * np.sqrt(float(np.diag(covariance).max()))))
+    grid = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1][::-1], axis=-1)
+    kernel = np.exp(-0.5 * np.einsum("...i,ij,...j", grid, np.linalg.inv(covariance), grid))
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
