@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
+from tpgmm_datasets.signals import CELL
 from tpgmm_tools.cli.learning import operators_or_default
 from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -26,9 +27,6 @@ __all__ = ["adopt", "check_dataset", "declared"]
 log = logging.getLogger(__name__)
 
 NAMES = {OBS_STATE: "state_names", ACTION: "action_names", OBS_ENV_STATE: "environment_names"}
-
-#: Of a tracked data set.
-CELL = "meta/cell.json"
 
 
 def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]]:
@@ -144,7 +142,7 @@ def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
 
 
 def declared(config: TPGMMConfig, features: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Units or offsets by name, where the data set declares them (this project's writer does)."""
+    """Units or offsets by name, where the data set (of this project's writer) declares them."""
     found: dict[str, Any] = {}
     for key in (OBS_STATE, ACTION):
         values = (features.get(key, {}).get("info") or {}).get(what)

@@ -16,7 +16,7 @@ from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.cell import Cell
 from tpgmm_vision.poses import Array, mean_pose, pose_matrix, pose_vector
-from tpgmm_vision.sources import ObservedPose, PoseSource, pose_source
+from tpgmm_vision.sources import ObservedPose, pose_source
 
 __all__ = ["Watch"]
 
@@ -65,7 +65,7 @@ class Watch:
             )
         cell.placed()
         self.cell, self.names = cell, tuple(names)
-        self._robot, self._sources = robot, list[PoseSource]()
+        self._robot, self._sources = robot, [pose_source(cell, robot)]
         self.reset()
 
     def reset(self) -> None:
