@@ -60,6 +60,9 @@ class Feature:
         One unit per value, where the metadata tell (those of this project's writer do).
     misnamed : str
         Why the names cannot be used.
+    offsets : tuple of float or None
+        What is added to each value once it is in radians or metres, where the metadata of a
+        tracked set tell: how far the motors are from the joints of the robot's description.
     """
 
     key: str
@@ -68,6 +71,7 @@ class Feature:
     names: tuple[str, ...] | None = None
     units: tuple[str, ...] | None = None
     misnamed: str = ""
+    offsets: tuple[float, ...] | None = None
 
     @property
     def width(self) -> int:
@@ -253,7 +257,18 @@ def _feature(key: str, entry: Any) -> Feature:
     if wrong:
         message = f"its units cannot be used, {wrong}: mend them, or leave them out"
         raise DatasetError(message, file=INFO, column=key)
-    return Feature(key, dtype, tuple(sizes), names, listed, misnamed)
+    offsets = extra.get("offsets") if isinstance(extra, dict) else None
+    if offsets is not None and not _numbers(offsets, width):
+        message = f"its joint offsets are {width} numbers in radians, got {str(offsets)[:80]}"
+        raise DatasetError(message, file=INFO, column=key)
+    shifts = None if offsets is None else tuple(map(float, offsets))
+    return Feature(key, dtype, tuple(sizes), names, listed, misnamed, shifts)
+
+
+def _numbers(values: Any, count: int) -> bool:
+    """Whether these are so many finite numbers."""
+    whole = isinstance(values, list) and len(values) == count
+    return whole and all(type(one) in (int, float) and math.isfinite(one) for one in values)
 
 
 def _listed_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
