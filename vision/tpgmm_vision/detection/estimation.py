@@ -286,7 +286,9 @@ class _Problem:
                 turn[0, 3:], turn[1, 3:] = (0, axis[2], -axis[1]), (-axis[2], 0, axis[0])
                 # further than a quarter turn away it is no nearer
                 away = (
-                    axis[:2] if axis[2] > 0 else axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3)
+                    axis[:2]
+                    if axis[2] > 0
+                    else axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3)
                 )
                 residual = np.append(residual, away / UPRIGHT_STD)
                 rates = np.concatenate((rates, turn / UPRIGHT_STD))
@@ -297,7 +299,8 @@ class _Problem:
 
     def judged(self, fit: _Fit, misfit: float) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
-        covariance: Array = np.linalg.pinv(fit.information, hermitian=True) * max(misfit, 1)
+        inverse_information = np.linalg.pinv(fit.information, hermitian=True)
+        covariance = np.asarray(inverse_information * max(misfit, 1), dtype=float)
         position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
                           (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
         reason, alternative = "", None

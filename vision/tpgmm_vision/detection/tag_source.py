@@ -133,9 +133,11 @@ class TagSource:
         return found
 
     def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
-        """What all cameras see of a target."""
+        """What all cameras see of a target that are where they were."""
         views = []
         for name, one in self._cameras.items():
+            if self._moved[name]:
+                continue
             seen = self.detections[name][target.family]
             views.append(View(one.camera, places[name], seen.corners, seen.covariances))
         return views
@@ -171,10 +173,10 @@ class TagSource:
             if (error := self._check_error(name, one, places[name])) is None:
                 continue
             self._moved[name] = self._moved[name] + 1 if error > MOVED else 0
-            if self._moved[name] < CONFIRMED:
+            if not self._moved[name]:
                 self._problems.pop(name, None)
-            elif said := self._said(name, one, places[name]):
-                self._problems[name] = said
+            elif self._moved[name] >= CONFIRMED and name not in self._problems:
+                self._problems[name] = self._said(name, one, places[name])
         self.problem = "; ".join(self._problems.values())
 
     def _check_error(self, name: str, one: CellCamera, place: Array) -> float | None:
@@ -191,19 +193,18 @@ class TagSource:
 
     def _said(self, name: str, one: CellCamera, place: Array) -> str:
         """What is said of a camera that was moved, as far as it is seen now."""
-        for check, known in self._cell.checks.items():
+        by = ""
+        for known in self._cell.checks.values():
             seen = self.detections[name][known.target.family]
             view = View(one.camera, np.eye(4), seen.corners, seen.covariances)
-            if (found := estimate_pose([view], known.target)) is None:
-                continue
-            now = known.pose @ inverse(found.pose)
-            far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
-            return (
-                f"camera {name!r} was moved, or the tag of {check!r}: it is "
-                f"{1e3 * far:.0f} mm and {np.degrees(turn):.1f} deg from where it was "
-                "calibrated; put it back, or run tpgmm calibrate cell again"
-            )
-        return ""
+            if found := estimate_pose([view], known.target):
+                now = known.pose @ inverse(found.pose)
+                far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
+                by = f" by {1e3 * far:.0f} mm and {np.degrees(turn):.1f} deg"
+        return (
+            f"camera {name!r} was moved{by}, or a tag of the checks {list(self._cell.checks)} "
+            "was; put it back, or run tpgmm calibrate cell again"
+        )
 
     def _around(
         self, name: str, one: CellCamera, places: Mapping[str, Array]
