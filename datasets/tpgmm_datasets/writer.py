@@ -157,12 +157,12 @@ class Column:
     ----------
     names : sequence of str
         Of its values.
-    values : mapping of int to ndarray of shape (T, width)
+    values : dict of int to ndarray of shape (T, width)
         By the episode's index; one type for all.
     """
 
     names: Sequence[str]
-    values: Mapping[int, np.ndarray[Any, Any]]
+    values: dict[int, np.ndarray[Any, Any]]
 
     @property
     def declared(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Smooth the measured poses of an object over a whole episode, looking both ways in time.
+"""The poses of an object over a whole episode, smoothed by looking both ways in time.
 
 Where the object is at rest, the robust mean of all its frames counts; where it moves, what was
 measured. Gaps are filled where it is known what the object did: it stood still before and
@@ -9,20 +9,18 @@ be unknown.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, Slerp
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array, inverse, mean_pose
 
-__all__ = ["Track", "smoothed"]
+__all__ = ["Track"]
 
-Flags = NDArray[np.bool_]
 #: Poses are as far apart as three points on their axes are in the mean, which are so far from
 #: the origin: an object is about as large [m].
 LEVER = 0.05
@@ -39,170 +37,142 @@ SHORT_GAP = 0.2
 LATE = 0.5
 
 
-@dataclass(frozen=True)
 class Track:
     """Where an object was in an episode.
 
     Parameters
     ----------
+    time : ndarray of shape (T,)
+        Of the rows [s].
+
+    Attributes
+    ----------
     poses : ndarray of shape (T, 4, 4)
         In the base frame.
     seen, known : ndarray of bool, shape (T,)
-        Whether it was measured in that row; whether it was measured or inferred.
+        Whether it was measured in a row; whether it was measured or inferred.
+    residuals : ndarray of shape (T,)
+        Of the corners, where it was seen [pixels].
+    reasons : list of str
+        Why it was not seen in a row.
     spread : float
-        How far measured frames are from the means of rests, root mean square [m].
+        How far measured positions are from the means of rests, root mean square [m].
     """
 
-    poses: Array
-    seen: Flags
-    known: Flags
-    spread: float
+    def __init__(self, time: Array) -> None:
+        self.time, rows = time, len(time)
+        self.poses, self.residuals = np.tile(np.eye(4), (rows, 1, 1)), np.zeros(rows)
+        self.seen, self.known = np.zeros((2, rows), dtype=bool)
+        self.reasons = [""] * rows
+        self._rest, self._tolerance, self.spread = np.full(rows, -1), REST_DISTANCE, 0.0
 
+    def smooth(self, hands: Mapping[str, Array]) -> None:
+        """Smooth the poses that were seen, and fill gaps.
 
-def smoothed(
-    time: Array, measured: Array, seen: Flags, hands: Mapping[str, Array] | None = None
-) -> Track:
-    """Smooth the poses of an object, and fill gaps.
+        Parameters
+        ----------
+        hands : mapping of str to ndarray of shape (T, 4, 4)
+            Poses of links that may carry it.
 
-    Parameters
-    ----------
-    time : ndarray of shape (T,)
-        [s]
-    measured : ndarray of shape (T, 4, 4)
-        Poses in the base frame.
-    seen : ndarray of bool, shape (T,)
-        Which of them were measured.
-    hands : mapping of str to ndarray of shape (T, 4, 4), optional
-        Poses of links that may carry it.
+        Raises
+        ------
+        DataError
+            If it was never seen, or first seen late.
+        """
+        index = np.flatnonzero(self.seen)
+        if not len(index):
+            raise DataError(f"it was never seen: {self.reasons[-1]}")
+        points, self.known = _points(self.poses[index]), self.seen.copy()
+        jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
+        noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
+        self._tolerance = max(REST_DISTANCE, REST_NOISE * noise)
+        squares = [np.zeros(0)]
+        for number, inside in enumerate(_rests(self.time[index], points, self._tolerance)):
+            rows = index[inside]
+            mean, agree = mean_pose(list(self.poses[rows]))
+            squares.append(np.square(self.poses[rows, :3, 3] - mean[:3, 3]).sum(axis=1))
+            stretch = slice(rows[agree][0], rows[agree][-1] + 1)
+            self._rest[stretch] = number
+            self._fill(stretch, mean)
+        self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares[1:] else 0.0
+        known = np.flatnonzero(self.known)
+        if known[0] > 0:
+            if self.time[known[0]] > LATE or self._rest[known[0]] < 0:
+                raise DataError(
+                    f"it was first seen {self.time[known[0]]:.2f} s after the start, "
+                    f"{'standing' if self._rest[known[0]] >= 0 else 'moving'}"
+                )
+            self._fill(slice(0, known[0]), self.poses[known[0]])
+        for a, b in pairwise(known.tolist()):
+            if b > a + 1:
+                self._bridge(a, b, hands)
+        self._finish(int(known[-1]), hands)
 
-    Raises
-    ------
-    DataError
-        If it was never seen, or first seen late.
-    """
-    if not seen.any():
-        raise DataError("it was never seen")
-    track = _Smoother(time, measured.copy(), seen, hands or {})
-    first, last = track.marked[[0, -1]]
-    if first > 0:
-        if time[first] > LATE or track.rest[first] < 0:
-            moves = "" if track.rest[first] >= 0 else ", and moves then"
-            raise DataError(f"it was first seen {time[first]:.2f} s after the start{moves}")
-        track.fill(slice(0, first), track.poses[first])
-    for a, b in pairwise(track.marked):
-        if b > a + 1:
-            track.bridge(int(a), int(b))
-    track.finish(int(last))
-    return Track(track.poses, seen, track.known, track.spread)
+    def _fill(self, rows: slice, poses: Array) -> None:
+        self.poses[rows], self.known[rows] = poses, True
+
+    def _bridge(self, a: int, b: int, hands: Mapping[str, Array]) -> None:
+        """Fill the gap between two known rows."""
+        ends, gap = self.poses[[a, b]], slice(a + 1, b)
+        apart = np.linalg.norm(np.diff(_points(ends), axis=0))
+        if min(self._rest[[a, b]]) >= 0 and apart < self._tolerance:
+            self._fill(gap, ends[0])
+        elif self.time[b] - self.time[a] <= SHORT_GAP:
+            self._fill(gap, _between(self.time[a : b + 1], ends))
+        else:
+            self.poses[gap] = ends[0]
+            found = [self._carried(hand, a, b) for hand in hands.values()]
+            off, taken, put, poses = min(
+                found, key=lambda one: one[0], default=(np.inf, a, b, ends)
+            )
+            if off <= PUT * self._tolerance:
+                self._fill(gap, poses[gap])
+                self._fill(slice(a + 1, taken + 1), ends[0])
+                self._fill(slice(put, b), ends[1])
+
+    def _carried(self, hand: Array, a: int, b: int) -> tuple[float, int, int, Array]:
+        """How well a hand explains a gap, from and to when it carried, and the poses then."""
+        taken, before = self._grasps(hand, a, np.arange(a, b), -1)
+        put, after = self._grasps(hand, b, np.arange(a + 1, b + 1), 1)
+        away = cdist(_points(before), _points(after))
+        away[(taken[:, None] >= put) | np.isnan(away)] = np.inf
+        i, j = np.unravel_index(away.argmin(), away.shape)
+        return float(away[i, j]), int(taken[i]), int(put[j]), hand @ before[i]
+
+    def _grasps(self, hand: Array, at: int, gap: Any, way: int) -> tuple[Any, Array]:
+        """Rows in which a hand may have taken or put down the object, and its poses in it."""
+        if self._rest[at] >= 0:
+            return gap, inverse(hand[gap]) @ self.poses[at]
+        return np.array([at]), self._held(hand, at, way)[1][None]
+
+    def _held(self, hand: Array, at: int, way: int) -> tuple[int, Array]:
+        """In how many rows up to (-1) or from (1) one a hand carries an object; its pose, or NaN."""
+        rows = np.flatnonzero(self.known)
+        rows = rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+        inside = inverse(hand[rows]) @ self.poses[rows]
+        points = _points(inside)
+        away = np.linalg.norm(points - np.median(points[:CARRIED_FRAMES], axis=0), axis=1)
+        count = int(np.append(away > self._tolerance, True).argmax())
+        moved = np.linalg.norm(_points(self.poses[rows]) - _points(self.poses[at]), axis=1)
+        if count < CARRIED_FRAMES or moved[:count].max() < CARRIED_WAY * self._tolerance:
+            return 0, np.full((4, 4), np.nan)
+        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
+
+    def _finish(self, last: int, hands: Mapping[str, Array]) -> None:
+        """Fill what follows the last known row."""
+        rows = slice(last + 1, len(self.time))
+        self.poses[rows] = self.poses[last]
+        found = [(*self._held(hand, last, -1), hand) for hand in hands.values()]
+        if self._rest[last] < 0 and found:
+            count, grasp, hand = max(found, key=lambda one: one[0])
+            if count:
+                self._fill(rows, hand[rows] @ grasp)
 
 
 def _points(poses: Array) -> Array:
     """Poses (..., 4, 4) as points (..., 9), whose distances are those of poses."""
     points = poses[..., :3, 3:] + LEVER * poses[..., :3, :3]
     return np.asarray(points.reshape(*poses.shape[:-2], 9) / np.sqrt(3))
-
-
-class _Smoother:
-    """Poses of an object while they are smoothed."""
-
-    def __init__(
-        self, time: Array, poses: Array, seen: Flags, hands: Mapping[str, Array]
-    ) -> None:
-        self.time, self.poses, self.seen, self.hands = time, poses, seen, hands
-        index = np.flatnonzero(seen)
-        points = _points(poses[index])
-        jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
-        noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
-        self.tolerance = max(REST_DISTANCE, REST_NOISE * noise)
-        self.rest, self.known = np.full(len(time), -1), seen.copy()
-        squares = []
-        for number, inside in enumerate(_rests(time[index], points, self.tolerance)):
-            mean, agree = mean_pose(list(poses[index[inside]]))
-            rows = index[inside][agree]
-            stretch = slice(rows[0], rows[-1] + 1)
-            at = poses[stretch][seen[stretch], :3, 3]
-            squares.append(np.square(at - mean[:3, 3]).sum(axis=1))
-            self.rest[stretch] = number
-            self.fill(stretch, mean)
-        self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares else 0.0
-        self.marked = np.flatnonzero(self.known)
-
-    def fill(self, rows: slice, poses: Array) -> None:
-        """Take poses for known."""
-        self.poses[rows], self.known[rows] = poses, True
-
-    def bridge(self, a: int, b: int) -> None:
-        """Fill the gap between two known rows."""
-        poses, gap = self.poses, slice(a + 1, b)
-        resting = self.rest[a] >= 0 and self.rest[b] >= 0
-        if resting and np.linalg.norm(np.diff(_points(poses[[a, b]]), axis=0)) < self.tolerance:
-            return self.fill(gap, poses[a])
-        if self.time[b] - self.time[a] <= SHORT_GAP:
-            return self.fill(gap, _between(self.time, poses, a, b))
-        found = [one for link in self.hands if (one := self._carried(link, a, b)) is not None]
-        if not found:
-            poses[gap] = poses[a]
-            return None
-        _, taken, put, hand, grasp = min(found, key=lambda one: one[0])
-        self.fill(slice(a + 1, taken + 1), poses[a])
-        self.fill(slice(put, b), poses[b])
-        return self.fill(
-            slice(max(taken, a + 1), min(put + 1, b)),
-            (hand @ grasp)[max(taken, a + 1) : min(put + 1, b)],
-        )
-
-    def _carried(
-        self, link: str, a: int, b: int
-    ) -> tuple[float, int, int, Array, Array] | None:
-        """When a link took the object in a gap, and put it down, and how far that is off."""
-        hand = self.hands[link]
-        taken, grasps = self._grasps(link, a, range(a, b), -1)
-        put, later = self._grasps(link, b, range(a + 1, b + 1), 1)
-        if not len(taken) or not len(put):
-            return None
-        away = cdist(_points(grasps), _points(later))
-        away[np.asarray(taken)[:, None] >= np.asarray(put)] = np.inf
-        i, j = np.unravel_index(away.argmin(), away.shape)
-        if away[i, j] > PUT * self.tolerance:
-            return None
-        return float(away[i, j]), taken[i], put[j], hand, grasps[i]
-
-    def _grasps(self, link: str, at: int, gap: range, way: int) -> tuple[list[int], Array]:
-        """Rows at which a link may have taken or put down the object, and its pose in it."""
-        if self.rest[at] >= 0:
-            return list(gap), inverse(self.hands[link][gap.start : gap.stop]) @ self.poses[at]
-        _, grasp = self._held(link, at, way)
-        return ([], np.empty((0, 4, 4))) if grasp is None else ([at], grasp[None])
-
-    def _held(self, link: str, at: int, way: int) -> tuple[int, Array | None]:
-        """Pose of the object in a link that carries it before (-1) or after (1) a row."""
-        rows = (
-            self.marked[self.marked <= at][::-1] if way < 0 else self.marked[self.marked >= at]
-        )
-        inside = inverse(self.hands[link][rows]) @ self.poses[rows]
-        points = _points(inside)
-        near = np.median(points[:CARRIED_FRAMES], axis=0)
-        away = np.linalg.norm(points - near, axis=1) > self.tolerance
-        count = int(away.argmax()) if away.any() else len(rows)
-        way_length = np.linalg.norm(
-            _points(self.poses[rows[:count]]) - _points(self.poses[at]), axis=1
-        )
-        if count < CARRIED_FRAMES or way_length.max() < CARRIED_WAY * self.tolerance:
-            return count, None
-        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
-
-    def finish(self, last: int) -> None:
-        """Fill what follows the last known row."""
-        rows = slice(last + 1, len(self.time))
-        self.poses[rows] = self.poses[last]
-        if self.rest[last] >= 0:
-            return
-        found = [(*self._held(link, last, -1), hand) for link, hand in self.hands.items()]
-        held = [
-            (count, hand[rows] @ grasp) for count, grasp, hand in found if grasp is not None
-        ]
-        if held:
-            self.fill(rows, max(held, key=lambda one: one[0])[1])
 
 
 def _rests(time: Array, points: Array, tolerance: float) -> list[list[int]]:
@@ -226,13 +196,10 @@ def _rests(time: Array, points: Array, tolerance: float) -> list[list[int]]:
     return found
 
 
-def _between(time: Array, poses: Array, a: int, b: int) -> Array:
-    """Interpolated poses of the rows between two."""
-    ends, inside = time[[a, b]], time[a + 1 : b]
-    found = np.tile(np.eye(4), (b - a - 1, 1, 1))
-    found[:, :3, :3] = Slerp(ends, Rotation.from_matrix(poses[[a, b], :3, :3]))(
-        inside
-    ).as_matrix()
-    share = ((inside - ends[0]) / (ends[1] - ends[0]))[:, None]
-    found[:, :3, 3] = (1 - share) * poses[a, :3, 3] + share * poses[b, :3, 3]
-    return found
+def _between(time: Array, ends: Array) -> Array:
+    """Poses (T - 2, 4, 4) at the times (T,) between two poses."""
+    share = ((time[1:-1] - time[0]) / (time[-1] - time[0]))[:, None, None]
+    found = (1 - share) * ends[0] + share * ends[1]
+    turns = Slerp(time[[0, -1]], Rotation.from_matrix(ends[:, :3, :3]))
+    found[:, :3, :3] = turns(time[1:-1]).as_matrix()
+    return np.asarray(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ Picture = NDArray[np.uint8]
 #: How far a picture of a video may be from the time of its row [periods]: below a half, so that
 #: no other picture is meant.
 OFF_ROW = 0.25
+#: Where an episode is in the videos: numbers, and from when to when [s].
+PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 #: Rows with images that are read at a time: what bounds the memory.
 IMAGE_ROWS = 16
 
@@ -54,25 +57,13 @@ class EpisodePictures:
                 file="meta/info.json",
             )
         self.videos = [key for key in keys if layout.features[key].dtype == "video"]
-        self._places: dict[tuple[str, int], tuple[int, int, float, float]] = {}
-        if layout.version == "v3.0" and self.videos:
-            self._read_places()
-
-    def _read_places(self) -> None:
-        """Where each episode is in the videos: chunk, file, and from when to when [s]."""
-        root, parts = self.layout.root, ("chunk_index", "file_index", "from_timestamp")
-        for path in chunked_files(root / "meta" / "episodes"):
+        self._places = dict[tuple[str, int], list[Any]]()
+        for path in chunked_files(layout.root / "meta" / "episodes"):  # of v3.0
             for key in self.videos:
-                columns = [f"videos/{key}/{part}" for part in (*parts, "to_timestamp")]
-                table = read_columns(path, root, ["episode_index", *columns])
-                for row in table.to_pylist():
-                    index, *place = row.values()
-                    if not all(isinstance(one, int | float) and one >= 0 for one in place):
-                        message = f"{place} is no place in a video: chunk, file, from, to"
-                        raise DatasetError(
-                            message, file=path.relative_to(root), episode=index, column=key
-                        )
-                    self._places[key, index] = tuple(place)
+                columns = [f"videos/{key}/{part}" for part in PLACE]
+                table = read_columns(path, layout.root, ["episode_index", *columns])
+                for index, *place in zip(*table.to_pydict().values(), strict=True):
+                    self._places[key, index] = place
 
     def read(self, episode: Episode, time: Array) -> Iterator[dict[str, Picture]]:
         """The pictures of each row of an episode, RGB of shape (height, width, 3), by key.
@@ -99,31 +90,32 @@ class EpisodePictures:
 
     def _video(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         layout, period = self.layout, 1 / self.layout.fps
-        *numbers, start, stop = self._places.get((key, episode.index), (0, 0, 0.0, 0.0))
-        place = (numbers[0], numbers[1]) if self._places else None
+        place: Any = None
+        start, stop = 0.0, len(time) / layout.fps
+        if layout.version == "v3.0":
+            *place, start, stop = self._places[key, episode.index]
         file = episode_file(layout.info, "video_path", episode.index, place, video_key=key)
         where: dict[str, Any] = {"file": file, "episode": episode.index, "column": key}
-        length = stop - start if place else len(time) * period
-        if abs(length - len(time) * period) > OFF_ROW * period:
-            message = f"the episode takes {length:.6g} s of the video, its rows "
+        if abs(stop - start - len(time) * period) > OFF_ROW * period:
+            message = f"the episode takes {stop - start:.6g} s of the video, its rows "
             raise _unlike(f"{message}{len(time)} x {period:.6g} s", where)
-        row = 0
+        row, at = 0, start
         for at, frame in _frames(layout.root / file, start, where):
             if row == len(time):
                 raise _unlike(f"the video goes on behind its {row} rows", where)
-            wanted = start + time[row]
-            if at < wanted - OFF_ROW * period:
-                continue
-            if at > wanted + OFF_ROW * period:
-                message = f"row {row} is at {wanted:.4f} s of the video, the next picture at "
-                raise _unlike(f"{message}{at:.4f} s", where)
-            yield frame.to_ndarray(format="rgb24")
-            row += 1
-            if row == len(time) and place:
-                break  # others follow in the same file
+            off = (at - start - time[row]) / period
+            if off > OFF_ROW:
+                break
+            if off > -OFF_ROW:
+                yield frame.to_ndarray(format="rgb24")
+                row += 1
+                if row == len(time) and place:
+                    return  # others follow in the same file
         if row < len(time):
-            message = f"the video ends before row {row} of {len(time)}, which is at "
-            raise _unlike(f"{message}{start + time[row]:.4f} s", where)
+            message = (
+                f"no picture is at {start + time[row]:.4f} s of the video, where row {row} is"
+            )
+            raise _unlike(f"{message}; the last that was looked at is at {at:.4f} s", where)
 
     def _images(self, key: str, episode: Episode, rows: int) -> Iterator[Picture]:
         root, count = self.layout.root, 0
@@ -147,27 +139,22 @@ def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
 
 def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[float, Any]]:
     """Time [s] and frame of a video, from the key frame before ``start`` on."""
-    if not path.is_file():
-        message = "the video is missing: sets are fetched with 'hf download', videos too"
-        raise DatasetError(message, check="missing", **where)
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
             # what is damaged is an error, not a guess of the decoder's
             stream.codec_context.options = {"err_detect": "explode"}
-            base = stream.time_base
-            if base is None:
-                raise DatasetError("the video has no clock", check="missing", **where)
+            base = stream.time_base or Fraction(1)
             container.seek(max(round(start / base) - 1, 0), stream=stream)
             for frame in container.decode(stream):
                 if frame.is_corrupt or frame.pts is None:
                     raise ValueError(f"a damaged picture at {frame.time} s")
                 yield float(frame.pts * base), frame
     except (av.error.FFmpegError, IndexError, ValueError) as error:
-        if isinstance(error, DatasetError):
-            raise
-        reason = str(error) or type(error).__name__
-        message = f"the video is damaged or of a kind that PyAV does not read ({reason})"
+        problem = (
+            "damaged, or of a kind that PyAV does not read" if path.is_file() else "missing"
+        )
+        message = f"the video is {problem} ({error})"
         raise DatasetError(message, check="missing", **where) from error
 
 
