@@ -68,10 +68,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_env_bimanual": (
         ("control_rate", "disturbances", "rendering"),
         ("base", "robot_scene"),
-        ("start",),
+        ("eyes", "start"),
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),
+        ("record",),
     ),
     "tpgmm_evaluation": (
         ("benchmarks", "policies", "processes", "variants"),
