@@ -11,6 +11,7 @@ from typing import Any
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.eyes import take_over
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
 from tpgmm_datasets.signals import CELL
@@ -47,8 +48,6 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     _check_rate(config, dataset)
     config.fps = float(dataset.fps)
     if (file := Path(dataset.root) / CELL).exists():
-        from lerobot_policy_tpgmm.eyes import take_over
-
         config.cell = take_over(config.cell or str(file), json.loads(read_whole(file)))
     if config.units is None:
         config.units = declared(config, dataset.features, "units")

@@ -8,17 +8,33 @@ from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL
+from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig
 from lerobot_policy_tpgmm.observations import FrameFeatures
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots import Kinematics, Robot
-from tpgmm_vision.cell import Cell, cell_of
-from tpgmm_vision.watching import Watch
 
-__all__ = ["cell_of", "image_features", "take_over", "watch"]
+__all__ = ["opened", "take_over", "watching"]
+
+# tpgmm_vision, which needs OpenCV, is imported where there is a cell
 
 log = logging.getLogger(__name__)
+
+
+def opened(config: TPGMMConfig) -> Any:
+    """The cell, if there is one; its content, and the pictures that it needs, are kept."""
+    inputs, visual = config.input_features or {}, FeatureType.VISUAL
+    config.input_features = {key: one for key, one in inputs.items() if one.type is not visual}
+    if config.cell in (None, NO_CELL):
+        return None
+    from tpgmm_vision.cell import cell_of
+
+    cell = cell_of(config.cell or {})
+    config.cell = dict(cell.content)
+    for one in cell.cameras.values() if cell.source != NO_CELL else ():
+        shape = 3, one.camera.height, one.camera.width
+        config.input_features[one.key] = PolicyFeature(visual, shape)
+    return cell
 
 
 def take_over(given: Mapping[str, Any] | str, learned: Mapping[str, Any]) -> dict[str, Any]:
@@ -31,6 +47,8 @@ def take_over(given: Mapping[str, Any] | str, learned: Mapping[str, Any]) -> dic
     learned : mapping
         The content of the other one.
     """
+    from tpgmm_vision.cell import cell_of
+
     if given == NO_CELL:
         return {**learned, "source": NO_CELL}
     cell = cell_of(given)
@@ -43,19 +61,12 @@ def take_over(given: Mapping[str, Any] | str, learned: Mapping[str, Any]) -> dic
     return dict(cell.content)
 
 
-def image_features(cell: Cell) -> dict[str, PolicyFeature]:
-    """The pictures that a cell needs."""
-    return {
-        one.key: PolicyFeature(FeatureType.VISUAL, (3, one.camera.height, one.camera.width))
-        for one in cell.cameras.values()
-        if cell.source != NO_CELL
-    }
-
-
-def watch(cell: Cell, robot: Kinematics, frames: FrameFeatures) -> Watch | None:
-    """What finds the frames of a policy, if its cell has a source of poses."""
-    if cell.source == NO_CELL:
+def watching(cell: Any, robot: Kinematics, frames: FrameFeatures) -> Any:
+    """What finds the frames of a policy, if it has a cell that has a source of poses."""
+    if cell is None or cell.source == NO_CELL:
         return None
+    from tpgmm_vision.watching import Watch
+
     links = [one for one in cell.links if one not in robot.links]
     if links and isinstance(robot, Robot):
         robot = decode(encode(robot) | {"links": [*robot.links, *links]})

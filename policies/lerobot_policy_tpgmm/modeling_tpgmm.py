@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, declared
+from lerobot_policy_tpgmm.eyes import opened, take_over, watching
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
@@ -161,7 +162,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             kinematics, operators = skill.kinematics, getattr(model, "operators_", ())
             required = (*skill.frame_names, *frame_names(config.via_operators(), kinematics))
         config.validate_features()
-        cell = self._cell()
+        cell = opened(config)
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
         self._make_mixture(operators, model)
         names = self.kinematics.joint_names
@@ -173,7 +174,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
         offsets = {} if cell is None else cell.joint_offsets
-        if dataset_meta is not None:
+        if dataset_meta is not None:  # of a converted set they are none
             offsets = declared(config, dataset_meta.features, "offsets")
         every = state_names, action_names, config.units
         self.joints = JointFeatures(names, *every, self.kinematics, offsets)
@@ -186,11 +187,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(seen, config.frames, *named, default, width)
-        self.watch: Any = None
-        if cell is not None:
-            from lerobot_policy_tpgmm.eyes import watch
-
-            self.watch = watch(cell, self.kinematics, self.frames)
+        self.watch = watching(cell, self.kinematics, self.frames)
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -222,19 +219,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         for operator in operators:
             operator.check(kinematics, known - set(kinematics.links))
         return kinematics, operators
-
-    def _cell(self) -> Any:
-        """The cell, if there is one; its content, and the pictures it needs, are kept."""
-        config, inputs = self.config, self.config.input_features.items()
-        config.input_features = {k: v for k, v in inputs if v.type is not FeatureType.VISUAL}
-        if config.cell in (None, NO_CELL):
-            return None
-        from lerobot_policy_tpgmm.eyes import cell_of, image_features
-
-        cell = cell_of(config.cell or {})
-        config.cell = dict(cell.content)
-        config.input_features |= image_features(cell)
-        return cell
 
     @staticmethod
     def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
@@ -413,6 +397,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._chunk: Chunk | None = None
         self._ticks, self._statuses = TickDurations(), dict[int, list[str]]()
         self._stand: Any = None
+        self._ages: dict[str, Any] = {}  # what keeps robots from moving
         if self.watch is not None:
             self.watch.reset()
 
@@ -487,10 +472,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         if ahead is None:
             return self.joints.action(self._stand)[:, None].repeat(1, self.config.chunk_size, 1)
         references = [self._step(ahead, batch, 1 / self.config.rate)]
-        moments, first, ages = [ahead], ahead, self._ages(ahead)
-        ahead = ahead.copy() if ages else ahead.ahead()
+        moments, first = [ahead], ahead
+        ahead = ahead.copy() if self._ages else ahead.ahead()
         while len(references) < self.config.chunk_size:
-            ahead.step(1 / self.config.rate, ages=ages)
+            ahead.step(1 / self.config.rate, ages=self._ages)
             references.append(ahead.reference.reshape(references[0].shape))
             moments.append(ahead.copy())
         joints = torch.stack(references, dim=1)
@@ -508,19 +493,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         first = self._controller is None and self._chunk is None
         if self.watch is None or not (first or self.config.control.follow_frames):
             return batch
-        images = {
-            key: batch[key].numpy(force=True) for key in batch if key.startswith(OBS_IMAGES)
-        }
+        images = {k: v.numpy(force=True) for k, v in batch.items() if k.startswith(OBS_IMAGES)}
         now, joints = batch.get(TIMESTAMP), self._observed(batch).numpy(force=True)
         times = None if now is None else now.flatten().numpy(force=True)
         self.watch.look(images, joints, passed, times)
-        found = self.watch.first() if first else self.watch.poses()
+        found, self._ages = (
+            self.watch.first() if first else self.watch.poses(),
+            self.watch.ages(),
+        )
         return self.frames.with_poses(batch, found)
-
-    def _ages(self, controller: Controller) -> dict[str, Any]:
-        """What keeps robots from moving."""
-        ages = {} if self.watch is None else self.watch.ages()
-        return {n: age[0] if controller.reference.ndim == 1 else age for n, age in ages.items()}
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
         """A running skill; None while robots stand because not all objects were seen."""
@@ -564,7 +545,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         measured = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
         passed = float(passed) if start.ndim == 1 else passed
-        command = controller.step(passed, *measured, ages=self._ages(controller))
+        command = controller.step(passed, *measured, ages=self._ages)
         if first:
             self._check_start(start, command.estimate.joints)
         self._log(command)
@@ -578,8 +559,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             reason, told = command.reason(robot if several else ()), [str(status)]
             if self.watch is not None:
                 unseen = self.watch.unseen(robot)
-                reason = "; ".join(filter(None, (reason, *unseen.values())))
-                told += filter(None, (self.watch.problems[robot], *unseen))
+                reason, told = (
+                    "; ".join(filter(None, (reason, *unseen.values()))),
+                    [*told, *unseen],
+                )
             if told != self._statuses.get(robot, [Status.RUNNING]):
                 what = f"{status}: {reason}" if reason else status
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
@@ -731,8 +714,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ),
             )
             if learned := json.loads(read_whole(folder / CONFIG_NAME)).get("cell"):
-                from lerobot_policy_tpgmm.eyes import take_over
-
                 config.cell = take_over(config.cell or NO_CELL, learned)
             policy = cls(config, model=model, **options).eval().to(config.device)
             validated(policy.skill)  # with the settings of the configuration

@@ -238,10 +238,9 @@ class FrameFeatures:
 
     def with_poses(self, batch: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
         """An observation in which frames are at poses (B, 7) that were ``found``."""
-        rows = len(batch[OBS_STATE])
-        environment = torch.full((rows, self.n_environment), math.nan, dtype=torch.float64)
-        if self.default is not None:
-            environment[:] = self.default
+        nothing = torch.full((self.n_environment,), math.nan, dtype=torch.float64)
+        known = nothing if self.default is None else self.default
+        environment = known.repeat(len(batch[OBS_STATE]), 1)
         for name, poses in found.items():
             environment[:, self.in_environment[name]] = torch.from_numpy(poses)
         return {**batch, OBS_ENV_STATE: environment.to(batch[OBS_STATE].device)}

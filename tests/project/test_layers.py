@@ -50,7 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("poses",),
         ("camera", "targets", "sources"),
         ("cell",),
-        ("detection",),
+        ("detection", "watching"),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
@@ -60,8 +60,9 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_policy_tpgmm": (
         ("settings", "tick_durations"),
         ("configuration_tpgmm",),
-        ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
-        ("policy_files", "training"),
+        ("processor_tpgmm", "observations", "mixture_parameters"),
+        ("eyes",),
+        ("dataset_contract", "policy_files", "training"),
         ("modeling_tpgmm",),
         ("lerobot_format", "async_server"),
     ),

@@ -42,6 +42,8 @@ class Watch:
 
     Attributes
     ----------
+    sources : list of PoseSource
+        Of the robots.
     problems : list of str
         Why nothing can be trusted that the cameras of a robot see; empty where it can.
 
@@ -65,12 +67,12 @@ class Watch:
             )
         cell.placed()
         self.cell, self.names = cell, tuple(names)
-        self._robot, self._sources = robot, [pose_source(cell, robot)]
+        self._robot, self.sources = robot, [pose_source(cell, robot)]
         self.reset()
 
     def reset(self) -> None:
         """Another episode begins."""
-        for source in self._sources:
+        for source in self.sources:
             source.reset()
         self.problems: list[str] = []
         self._seen: list[dict[str, ObservedPose]] = []
@@ -112,13 +114,13 @@ class Watch:
         now = np.broadcast_to(before + passed if times is None else times, len(rows))
         elapsed = now - before if self._seen else np.zeros(len(rows))
         self._real, self._times, self._seen = real, now, []
-        while len(self._sources) < len(rows):
-            self._sources.append(pose_source(self.cell, self._robot))
+        while len(self.sources) < len(rows):
+            self.sources.append(pose_source(self.cell, self._robot))
         for row in rows:
             known = dict(zip(self._robot.joint_names, joints[row].tolist(), strict=True))
             here = {key: stack[row] for key, stack in pictures.items()}
-            self._seen.append(self._sources[row].poses(here, known, float(now[row])))
-        self.problems = [self._sources[row].problem for row in rows]
+            self._seen.append(self.sources[row].poses(here, known, float(now[row])))
+        self.problems = [getattr(self.sources[row], "problem", "") for row in rows]
         for row, name in product(rows, self.names):
             pose, at = self._pose(row, name), (row, name)
             recent = self._recent.setdefault(at, deque(maxlen=RECENT))
@@ -196,17 +198,25 @@ class Watch:
             if self._mean(row, name) is None
         ]
 
-    def ages(self) -> dict[str, Array]:
-        """Infinite where a problem keeps robots from moving (B,), by problem [s]."""
+    def ages(self) -> dict[str, Any]:
+        """Infinite where a problem keeps robots from moving, by problem [s].
+
+        Of shape (B,), of a single robot a number.
+        """
         every = np.array(self.problems)
         return {
-            text: np.where(every == text, np.inf, 0.0)
+            text: np.where(every == text, np.inf, 0.0) if len(every) > 1 else np.inf
             for text in dict.fromkeys(self.problems)
             if text
         }
 
     def unseen(self, row: int) -> dict[str, str]:
-        """Objects that a robot has not seen for a while: for how long, and why."""
+        """Objects that a robot has not seen for a while: for how long, and why.
+
+        A problem stands for all of them, without further words.
+        """
+        if problem := self.problems[row]:
+            return {problem: ""}
         ages = {name: self._unseen.get((row, name), 0.0) for name in self.names}
         return {
             name: f"{self._why(row, name)} is not seen for {age:.2g} s"
