@@ -14,7 +14,7 @@ from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
-from tpgmm_datasets.units import Scale, as_scale
+from tpgmm_datasets.units import Scale, shifted
 
 __all__ = ["Signals"]
 
@@ -82,8 +82,8 @@ class Signals:
         action = action and _renamed(action, source, called, given)
         environment = layout.features.get(ENVIRONMENT)
         scales = {
-            name: as_scale(unit, source.key)
-            for name, unit in zip(columns.names or (), columns.units, strict=False)
+            name: scale
+            for name, scale in zip(columns.names or (), columns.scales, strict=False)
             if robot is None or name in robot.joint_names
         }
         for feature in (state, action):
@@ -125,8 +125,9 @@ def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
     """What else holds the joints declares the same units, if any."""
     names, units = feature.names or (), feature.units or ()
     matched = match_names(list(scales), names, feature.key, REMEDY)
-    for entry, unit in zip(names, units, strict=True):
+    own = shifted(units, feature.offsets, feature.key)
+    for entry, unit, scale in zip(names, units, own, strict=True):
         joint = matched.get(entry)
-        if joint and unit != "raw" and as_scale(unit, feature.key) != scales[joint]:
+        if joint and unit != "raw" and scale != scales[joint]:
             message = f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit"
             raise DatasetError(f"{message}: a policy needs one of both", column=feature.key)

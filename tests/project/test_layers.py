@@ -36,7 +36,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
-        ("errors",),
+        ("errors", "least_squares"),
         ("names",),
         ("units", "robots"),
         ("checks",),
@@ -51,6 +51,8 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("camera", "targets", "sources"),
         ("cell", "printing"),
         ("detection",),
+        ("episodes",),
+        ("calibration",),
         ("commands",),
     ),
     "tpgmm_tools": (
@@ -69,10 +71,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_env_bimanual": (
         ("control_rate", "disturbances", "rendering"),
         ("base", "robot_scene"),
-        ("start",),
+        ("eyes", "start"),
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),
+        ("record",),
     ),
     "tpgmm_evaluation": (
         ("benchmarks", "policies", "processes", "variants"),
