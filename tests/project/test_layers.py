@@ -36,7 +36,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
-        ("errors",),
+        ("errors", "least_squares"),
         ("names",),
         ("units", "robots"),
         ("checks",),
@@ -49,9 +49,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_vision": (
         ("poses",),
         ("camera", "targets", "sources"),
-        ("cell",),
-        ("detection",),
+        ("cell", "printing"),
+        ("detection", "watching"),
         ("episodes",),
+        ("calibration",),
+        ("commands",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
@@ -61,18 +63,20 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_policy_tpgmm": (
         ("settings", "tick_durations"),
         ("configuration_tpgmm",),
-        ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
-        ("policy_files", "training"),
+        ("processor_tpgmm", "observations", "mixture_parameters"),
+        ("eyes",),
+        ("dataset_contract", "policy_files", "training"),
         ("modeling_tpgmm",),
         ("lerobot_format", "async_server"),
     ),
     "lerobot_env_bimanual": (
         ("control_rate", "disturbances", "rendering"),
         ("base", "robot_scene"),
-        ("start",),
+        ("eyes", "start"),
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),
+        ("record",),
     ),
     "tpgmm_evaluation": (
         ("benchmarks", "policies", "processes", "variants"),

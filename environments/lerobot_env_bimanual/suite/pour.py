@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, TURN, TURNED_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -51,6 +52,8 @@ BOX = Box((0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0)
 #: Where the palms touch them, and where they wait, in their frames [m].
 GRIP = {"l_hand": (0.0, JUG + 0.01, 0.01), "r_hand": (0.0, -CUP - 0.01, 0.0)}
 WAIT = {"l_hand": (-0.05, 0.1, 0.01), "r_hand": (-0.05, -0.1, 0.0)}
+#: The jug's tags are at its lower end, which is away from the cup's when it is tilted [m].
+LOW = -0.03
 #: How high the jug is lifted before it is carried [m].
 LIFT = 0.05
 #: Where the cup is held [m], and by how much it sways from there while it is poured into.
@@ -82,6 +85,10 @@ class Pour(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
         "bring": 2.0, "tilt": 1.6, "pour": 1.6, "back": 1.6, "leave": 1.6, "rest": 0.4,
     }  # fmt: skip
+    carriers: ClassVar = {
+        "cup": cube_at(10, CUP + CUBE_ROOM),
+        "jug": cube_at(20, JUG + TURNED_ROOM, z=LOW, turn=TURN),
+    }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
     figures: ClassVar = {

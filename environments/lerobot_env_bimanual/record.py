@@ -1,0 +1,320 @@
+"""Record demonstrations of the tasks with cameras, as LeRobot data sets with videos.
+
+``python -m lerobot_env_bimanual.record --task pour --n 10 --cameras front --out out/pour``
+writes a set with ``observation.state``, ``action``, the cameras' videos, and the true cell file
+in it; the poses of the objects are in the pictures alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
+from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
+from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.eyes import calibration
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
+from lerobot_env_bimanual.eyes.lens import Imperfections
+from lerobot_env_bimanual.eyes.recorder import CODECS, recording, row
+from lerobot_env_bimanual.eyes.rig import Rig
+from lerobot_env_bimanual.eyes.views import CHECK
+from lerobot_env_bimanual.robot_scene import PALM_SIZE
+from lerobot_env_bimanual.suite.env import SuiteEnv
+from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.tasks import suite_task
+from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
+from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
+from tpgmm_torch import Demonstration
+from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
+
+__all__ = ["CALIBRATION", "EXPERTS", "Expert", "expert", "main", "record"]
+
+Vector = NDArray[np.float64]
+#: Time steps per second of the experts' motions, whatever the rate of the set.
+RATE = 100.0
+#: The task of showing tags to the cameras, and the first tag of the cube in each hand.
+CALIBRATION, IN_HAND = "calibration", {"l_hand": 30, "r_hand": 40}
+#: Attempts for each episode that is asked for; experts fail seldom.
+ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Expert:
+    """Who demonstrates a task, and where.
+
+    Parameters
+    ----------
+    environment : callable
+        Makes the environment, of ``fps`` and other options.
+    motion : callable
+        The demonstration that belongs to a seed.
+    objects : tuple of str
+        What is observed.
+    """
+
+    environment: Callable[..., ControlledEnv]
+    motion: Callable[[int], Demonstration]
+    objects: tuple[str, ...]
+
+    def start(self, motion: Demonstration) -> dict[str, Any]:
+        """The options with which an episode begins as a demonstration does."""
+        start: dict[str, Any] = {"joints": motion.joints[0].numpy()}
+        for name in self.objects:
+            pose = motion.frame(name)
+            pose = pose[0] if pose.batch_shape else pose
+            start[name] = torch.cat((pose.position, pose.orientation)).numpy()
+        if motion.frame(self.objects[0]).batch_shape:  # it slides in the hands
+            start["slide"] = slid(motion)
+        return start
+
+
+def expert(task: str, robot: str = UPPER_BODY) -> Expert:
+    """The expert of a task by its name, and that of the robot.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If there is none.
+    """
+    if task not in EXPERTS:
+        raise UnknownNameError("task", task, "the recorder", EXPERTS)
+    if task in SUITE:
+        able = suite_task(task, robot)
+        made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
+        return Expert(made, lambda seed: of(1, seed)[0], able.objects)
+    if robot != UPPER_BODY:
+        raise DataError(f"{task} is done by {UPPER_BODY} alone, not by {robot!r}")
+    return BOTTLES[task]
+
+
+BOTTLES = {
+    "bottle_shaking": Expert(
+        partial(BottleShakingEnv, track=True),
+        lambda seed: BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(1, seed)[0],
+        ("bottle",),
+    ),
+    "carry_and_put": Expert(
+        CarryAndPutEnv,
+        lambda seed: CarryAndPut(rate=RATE).demonstrations(1, seed)[0],
+        ("bottle", "tray"),
+    ),
+}
+#: What can be recorded.
+EXPERTS = (*BOTTLES, *SUITE)
+
+
+def record(
+    task: str,
+    out: str | Path,
+    *,
+    n: int = 10,
+    seed: int = 0,
+    cameras: str | Sequence[str] = "front",
+    fps: int = 25,
+    size: tuple[int, int] = (640, 480),
+    robot: str = UPPER_BODY,
+    codec: str = "av1",
+    imperfections: Imperfections | None = None,
+    true_poses: bool = False,
+    noise: float = 0.0,
+    hand: str = "r_hand",
+    offset_deg: float = 0.0,
+    noise_deg: float = 0.0,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Path:
+    """Let an environment follow the expert's motions, and record what its cameras see.
+
+    ``observation.state`` is what was measured, ``action`` the reference for the end of each
+    period. Demonstrations that do not succeed by the rules of the environment are not kept.
+
+    ``"calibration"`` is no task: the robot shows a cube of tags in its hand to the first camera
+    in varied postures, in one episode.
+
+    Parameters
+    ----------
+    task : str
+        One of :data:`EXPERTS`, or ``"calibration"``.
+    out : str or Path
+        The folder; it must not exist.
+    n : int, default=10
+        How many episodes, or postures.
+    seed : int, default=0
+        Of the demonstrations and of all noise.
+    cameras : str or sequence of str, default="front"
+        Of :data:`~lerobot_env_bimanual.eyes.views.VIEWS`.
+    fps : int, default=25
+        Rows per second; a divisor of 1000.
+    size : (int, int)
+        Width and height of the pictures.
+    robot : str, default="upper_body"
+        Who does a task of the suite, or is calibrated.
+    codec : {"av1", "h264", "pictures"}, default="av1"
+    imperfections : Imperfections, optional
+        What spoils the pictures.
+    true_poses : bool, default=False
+        Whether the poses of the objects are recorded too, in ``observation.environment_state``.
+    noise : float, default=0
+        Of the sensors, as of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`.
+    hand : {"r_hand", "l_hand"}, default="r_hand"
+        That has the tags in a calibration.
+    offset_deg, noise_deg : float, default=0
+        Standard deviations of constant errors of the joints that move this hand, and of the
+        noise of each reading, in a calibration [deg]. The constant ones are ``joint_offsets``
+        of the cell file.
+    progress : callable, optional
+        Is given a line after each episode.
+
+    Returns
+    -------
+    Path
+        The folder, with the true ``cell.json`` in it.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the folder exists, an option is not one of the above, so many demonstrations do not
+        succeed, or so few postures show the tags.
+    """
+    if n < 1:
+        raise DataError(f"at least one episode is recorded, got n={n}")
+    shows, rng = task == CALIBRATION, np.random.default_rng(seed)
+    if hand not in HANDS:
+        raise UnknownNameError("hand", hand, "the recorder", HANDS)
+    able = expert("lid" if shows else task, robot)
+    env = able.environment(fps=fps, noise=noise)
+    names, offsets, options = env.joint_names, np.zeros(len(env.joint_names)), dict[str, Any]()
+    if shows:
+        side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
+        cube = cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)
+        options = {"carriers": {**CHECK, hand: cube}, "objects": {}}
+    rig = env.rig(cameras, size, imperfections=imperfections, **options)
+    if not rig.views:
+        raise DataError("a set with videos needs a camera: --cameras front")
+    env.reset(seed=seed)
+    cell = {**rig.content(), "joints": list(names)}
+    if shows:
+        moved = calibration.chain_of(rig, hand)
+        offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
+        cell |= {"joint_offsets": {names[one]: float(offsets[one]) for one in moved}}
+    settings = {"objects": able.objects if true_poses else (), "robot_type": robot}
+    sizes = dict.fromkeys(rig.views, size)
+    with recording(out, fps, names, sizes, cell, codec=codec, **settings) as opened:
+        if shows:
+            postures = calibration.varied_postures(rig, hand, n, rng)
+
+            def measured(joints: Vector) -> Vector:
+                noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
+                return np.asarray(joints - offsets + noise)
+
+            for one in calibration.calibration_episode(
+                rig, postures, fps, rng, measured, lambda joints: joints - offsets
+            ):
+                opened.add_frame(one)
+            opened.save_episode()
+        else:
+            _demonstrate(opened, able, env, rig, n, seed, true_poses, progress)
+    rig.close()
+    return Path(out)
+
+
+def _demonstrate(
+    opened: Any,
+    able: Expert,
+    env: ControlledEnv,
+    rig: Rig,
+    n: int,
+    seed: int,
+    true_poses: bool,
+    progress: Callable[[str], None],
+) -> None:
+    """Record demonstrations until so many succeed."""
+    for number in range(ATTEMPTS * n):
+        # each has numbers of its own: episode 3 is the same, however many there are
+        rng = np.random.default_rng((seed, number))
+        motion = able.motion(int(rng.integers(2**31)))
+        start, time, over = able.start(motion), motion.time.numpy(), False
+        observation, info = env.reset(seed=int(rng.integers(2**31)), options=start)
+        ticks = np.arange(1, int(time[-1] * env.fps + 1e-6) + 2) / env.fps
+        ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
+        for reference in np.stack(ways, axis=1):
+            poses = observation["environment_state"] if true_poses else None
+            seen, joints = rig.pictures(rng), observation["agent_pos"]
+            opened.add_frame(row(env.task_description, joints, reference, seen, poses))
+            observation, _, _, over, info = env.step(reference)
+        while not over:
+            *_, over, info = env.step(reference)
+        if info["is_success"]:
+            opened.save_episode()
+        else:
+            opened.clear_episode_buffer()
+        failed = "" if info["is_success"] else ": one failed, and is not kept"
+        progress(f"episode {opened.num_episodes} of {n}{failed}")
+        if opened.num_episodes == n:
+            return
+    raise DataError(
+        f"of {ATTEMPTS * n} demonstrations {opened.num_episodes} succeed, {n} are asked for"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m lerobot_env_bimanual.record",
+        description="Record demonstrations with cameras as a LeRobot data set with videos.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add, motion = parser.add_argument, f"of the task {CALIBRATION}"
+    tasks = (*EXPERTS, CALIBRATION)
+    add("--task", required=True, choices=tasks, help=f"{CALIBRATION} shows tags in a hand")
+    add("--out", required=True, help="folder of the set; it must not exist")
+    add("--n", type=int, default=10, help="episodes, or postures")
+    add("--seed", type=int, default=0, help="of demonstrations and noise")
+    add("--cameras", default="front", help="names, with commas between them")
+    add("--fps", type=int, default=25, help="rows per second")
+    add("--size", type=int, nargs=2, default=(640, 480), help="width and height of pictures")
+    add("--robot", choices=ROBOTS, default=UPPER_BODY, help="who does it")
+    add("--codec", choices=CODECS, default="av1", help="of the videos")
+    add("--noise", type=float, default=0.0, help="of the sensors, in demonstrations")
+    add("--true-poses", action="store_true", help="demonstrations with the poses of objects")
+    add("--hand", choices=HANDS, default=HANDS[1], help=f"that has the tags, {motion}")
+    add("--offset-deg", type=float, default=0.0, help=f"constant, of joints, {motion}")
+    add("--noise-deg", type=float, default=0.0, help=f"of joints, {motion}")
+    given = vars(parser.parse_args(arguments))
+    task, given["size"] = given["task"], tuple(given["size"])
+    others = ("noise", "true_poses"), ("hand", "offset_deg", "noise_deg")
+    for name in others[task != CALIBRATION]:
+        if given[name] != parser.get_default(name):
+            parser.error(f"--{name.replace('_', '-')} is no option of the task {task}")
+    _report_errors_alone()
+    try:
+        record(**given, progress=partial(print, file=sys.stderr, flush=True))
+    except TPGMMError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"recorded {given['out']}")
+    return 0
+
+
+def _report_errors_alone() -> None:
+    """Quieten libraries: progress is what this command says."""
+    from datasets.utils.logging import disable_progress_bar
+
+    os.environ.setdefault("SVT_LOG", "1")
+    logging.getLogger("lerobot").setLevel(logging.ERROR)
+    disable_progress_bar()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
