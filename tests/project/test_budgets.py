@@ -52,9 +52,9 @@ BUDGETS = {
 #: when its budget is reached.
 CEILINGS = {
     "lines of tpgmm_torch": 13860,
-    "lines of tpgmm_datasets": 4690,
+    "lines of tpgmm_datasets": 4760,
     "lines of lerobot_policy_tpgmm": 2030,
-    "lines of tpgmm_tools": 2840,
+    "lines of tpgmm_tools": 2875,
     "lines of environments and evaluation": 8950,
     "lines of tests of core, data sets, policy and tools": 19330,
     "longest function of the core": 81,

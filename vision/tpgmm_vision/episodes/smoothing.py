@@ -28,8 +28,8 @@ LEVER = 0.05
 REST_DISTANCE, REST_NOISE = 0.003, 3.0
 #: A rest takes this long [s], and has so many frames; so many frames elsewhere end it.
 REST_TIME, REST_FRAMES, ELSEWHERE = 0.3, 5, 3
-#: Of a hand that carries an object so many frames must tell, over a way of so many times that by
-#: which its place in the hand may change, as for ``find_holds`` [m].
+#: Of a hand that carries an object so many frames must tell, over a way of so many times that
+#: by which its place in the hand may change, as for ``find_holds`` [m].
 CARRIED_FRAMES, CARRIED_WAY, SLIP = 3, 3.0, 0.01
 #: A gap in a motion that is interpolated, as long as a hand's motion is nearly straight [s].
 SHORT_GAP = 0.2

@@ -12,7 +12,14 @@ import torch
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, summed_up
-from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, with_frames
+from tpgmm_datasets.lerobot.columns import (
+    ACTION,
+    ENVIRONMENT,
+    KNOWN,
+    RESIDUAL,
+    SEEN,
+    with_frames,
+)
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout
@@ -33,10 +40,6 @@ from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transfo
 from tpgmm_vision.sources import ObservedPose, pose_source
 
 __all__ = ["track_lerobot"]
-
-#: Columns of a tracked set; their names do not begin with "observation.", so that no policy
-#: takes them for something that it is given.
-SEEN, KNOWN, RESIDUAL = "tracking.seen", "tracking.known", "tracking.residual"
 
 
 def track_lerobot(
