@@ -19,9 +19,9 @@ __all__ = ["CUBE_ROOM", "TURN", "TURNED_ROOM", "Carrier", "add_carrier", "cube_a
 
 #: Edges of the black squares of tags on cubes, and of those that lie flat [m].
 CUBE, FLAT = 0.040, 0.060
-#: How far from a surface the middle of a cube is that is fixed to it [m], and the same of a cube
-#: that is turned: by so much on the left of the table, where the front camera looks along x [deg].
-CUBE_ROOM, TURN = CUBE * 10 / 16 + 0.002, -25.0
+#: Cubes on the left of the table, where the front camera looks along x, are turned by so much
+#: [deg]. How far from a surface the middle of a cube is [m], and of one that is turned.
+TURN, CUBE_ROOM = -25.0, CUBE * 10 / 16 + 0.002
 TURNED_ROOM = 1.33 * CUBE_ROOM
 #: Pixels of a module of a tag: with a power of two, its mipmaps keep the edges of modules.
 PIXELS = 32
