@@ -36,7 +36,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
-        ("errors",),
+        ("errors", "least_squares"),
         ("names",),
         ("units", "robots"),
         ("checks",),
@@ -49,7 +49,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_vision": (
         ("poses",),
         ("camera", "targets", "sources"),
-        ("cell",),
+        ("cell", "printing"),
+        ("detection", "watching"),
+        ("episodes",),
+        ("calibration",),
+        ("commands",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
@@ -59,8 +63,9 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_policy_tpgmm": (
         ("settings", "tick_durations"),
         ("configuration_tpgmm",),
-        ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
-        ("policy_files", "training"),
+        ("processor_tpgmm", "observations", "mixture_parameters"),
+        ("eyes",),
+        ("dataset_contract", "policy_files", "training"),
         ("modeling_tpgmm",),
         ("lerobot_format", "async_server"),
     ),

@@ -39,12 +39,16 @@ import numpy as np
 from tpgmm_torch.atomic import read_whole, replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, pose_matrix, pose_vector
+from tpgmm_vision.poses import Array, angle_between, pose_matrix, pose_vector
 from tpgmm_vision.targets import Target, target_from
 
 __all__ = [
-    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "read_cell", "write_cell",
+    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "cell_of", "read_cell",
+    "write_cell",
 ]  # fmt: skip
+
+#: Poses that are nearer to each other are the same: [mm], [deg].
+SAME_PLACE, SAME_ANGLE = 0.1, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +81,9 @@ class CellObject:
     Parameters
     ----------
     target : Target
+        Without tags where another source finds the object.
     pose : ndarray of shape (4, 4)
-        Of the object's frame in that of the target.
+        Of the object's frame in that of the target, or in what the other source finds.
     upright : bool
         Whether its z axis is always vertical.
     height : float, optional
@@ -132,6 +137,32 @@ class Cell:
     source: str = "tags"
     content: Mapping[str, Any] = field(default_factory=dict)
 
+    def differences(self, other: Cell) -> list[str]:
+        """What is another one in another cell, in words, one for each thing."""
+        told = []
+        for kind in ("cameras", "objects", "checks"):
+            one, two = getattr(self, kind), getattr(other, kind)
+            told += [f"{name!r} of the {kind} is missing" for name in one.keys() - two]
+            told += [f"{name!r} of the {kind} is new" for name in two.keys() - one]
+            for name in sorted(one.keys() & two):
+                before, after = (cell.content[kind][name] for cell in (self, other))
+                keys = sorted({*before, *after} - {"pose", "report"})
+                changed = [key for key in keys if before.get(key) != after.get(key)]
+                if changed:
+                    told.append(f"{name!r} of the {kind} has another {' and '.join(changed)}")
+                told += _moved(f"{name!r} of the {kind}", one[name].pose, two[name].pose)
+        shifts = self.shifts(other).items()
+        return told + [
+            f"joint {name!r} is offset by {math.degrees(shift):+.2f} deg more"
+            for name, shift in shifts
+        ]
+
+    def shifts(self, other: Cell) -> dict[str, float]:
+        """By how much the offsets of joints are larger in another cell [rad]."""
+        one, two = self.joint_offsets, other.joint_offsets
+        shifts = {name: two.get(name, 0.0) - one.get(name, 0.0) for name in {**one, **two}}
+        return {name: shift for name, shift in shifts.items() if shift}
+
     @property
     def links(self) -> tuple[str, ...]:
         """Links that carry cameras."""
@@ -154,6 +185,22 @@ class Cell:
                 else "the cell has no cameras: tpgmm calibrate camera adds one"
             )
         return dict(self.cameras)
+
+
+def _moved(what: str, before: Array | None, after: Array | None) -> list[str]:
+    """How far something is from where it was, if it is."""
+    if before is None or after is None:
+        return []
+    moved = 1e3 * float(np.linalg.norm(before[:3, 3] - after[:3, 3]))
+    turned = math.degrees(angle_between(before, after))
+    if moved < SAME_PLACE and turned < SAME_ANGLE:
+        return []
+    return [f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg"]
+
+
+def cell_of(given: Mapping[str, Any] | str | Path) -> Cell:
+    """The cell of a file, or of its content."""
+    return cell_from(given) if isinstance(given, Mapping) else read_cell(given)
 
 
 def read_cell(path: str | Path) -> Cell:
@@ -246,7 +293,10 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
 
 
 def _check_unique(cell: Cell, where: str) -> None:
-    """Each tag and each picture belongs to one entry."""
+    """Each tag and each picture belongs to one entry; objects that tags find have some."""
+    for name, thing in cell.objects.items():
+        if cell.source == "tags" and not thing.target.corners:
+            raise DataError(f"{where}: objects: {name} needs 'target', the tags on it")
     targets: list[tuple[str, CellObject | CellCheck]] = list(cell.objects.items())
     targets += cell.checks.items()
     owners: dict[tuple[str, int], str] = {}
@@ -361,9 +411,9 @@ def _camera(entry: _Entry) -> CellCamera:
 
 def _object(entry: _Entry) -> CellObject:
     entry.allow("target", "pose", "upright", "height")
-    pose, upright, height = (entry.get(name) for name in ("pose", "upright", "height"))
+    target, pose, upright, height = map(entry.get, ("target", "pose", "upright", "height"))
     return CellObject(
-        _target(entry.need("target")),
+        Target({}) if target is None else _target(target),
         np.eye(4) if pose is None else pose.pose(),
         upright is not None and upright.flag(),
         None if height is None else height.number(),
