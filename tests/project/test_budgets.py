@@ -55,7 +55,7 @@ CEILINGS = {
     "lines of tpgmm_datasets": 4690,
     "lines of lerobot_policy_tpgmm": 1920,
     "lines of tpgmm_tools": 2840,
-    "lines of environments and evaluation": 8950,
+    "lines of environments and evaluation": 9400,
     "lines of tests of core, data sets, policy and tools": 19330,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,
