@@ -176,7 +176,10 @@ class ControlledEnv(StateEnv):
             Of :class:`~lerobot_env_bimanual.eyes.rig.Rig`: other ``carriers``,
             ``imperfections``.
         """
-        usual = {"carriers": {**CHECK, **self.carriers}, "camera": usual_camera(*size)}
+        usual: dict[str, Any] = {
+            "carriers": {**CHECK, **self.carriers},
+            "camera": usual_camera(*size),
+        }
         return Rig(self._scene, chosen_views(cameras), **usual | options)
 
     def close(self) -> None:

@@ -208,7 +208,10 @@ def record(
         moved = calibration.chain_of(rig, hand)
         offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
         cell |= {"joint_offsets": {names[one]: float(offsets[one]) for one in moved}}
-    settings = {"objects": able.objects if true_poses else (), "robot_type": robot}
+    settings: dict[str, Any] = {
+        "objects": able.objects if true_poses else (),
+        "robot_type": robot,
+    }
     sizes = dict.fromkeys(rig.views, size)
     with recording(out, fps, names, sizes, cell, codec=codec, **settings) as opened:
         if shows:

@@ -34,7 +34,7 @@ def test_demonstrations_are_recorded_as_they_are_done(tmp_path, capsys):
     frames = {name: shown.frame(name) for name in cell.objects}
     first = {name: one[0] if one.batch_shape else one for name, one in frames.items()}
     poses = {name: np.append(one.position, one.orientation) for name, one in first.items()}
-    env.reset(seed=0, options={"joints": shown.joints[0], **poses})
+    env.reset(seed=0, options={"joints": shown.joints[0].numpy(), **poses})
     for row in range(len(read)):
         observation, *_ = env.step(read.hf_dataset[row]["action"].numpy())
     np.testing.assert_allclose(observation["agent_pos"], shown.joints[-1], atol=0.01)

@@ -15,14 +15,12 @@ from lerobot_env_bimanual.robot_scene import add_geom
 from tpgmm_vision.poses import Array, pose_vector, rigid
 from tpgmm_vision.targets import FAMILIES, Target, modules_of, target_from
 
-__all__ = ["CUBE_ROOM", "TURN", "TURNED_ROOM", "Carrier", "add_carrier", "cube_at", "flat_at"]
+__all__ = ["CUBE_ROOM", "Carrier", "add_carrier", "cube_at", "flat_at"]
 
 #: Edges of the black squares of tags on cubes, and of those that lie flat [m].
 CUBE, FLAT = 0.040, 0.060
-#: How far from a surface the middle of a cube is that is fixed to it [m], and the same of a cube
-#: that is turned: by so much on the left of the table, where the front camera looks along x [deg].
-CUBE_ROOM, TURN = CUBE * 10 / 16 + 0.002, -25.0
-TURNED_ROOM = 1.33 * CUBE_ROOM
+#: How far from a surface the middle of a cube is that is fixed to it [m].
+CUBE_ROOM = CUBE * 10 / 16 + 0.002
 #: Pixels of a module of a tag: with a power of two, its mipmaps keep the edges of modules.
 PIXELS = 32
 #: Of the plates on which tags are drawn [m].
@@ -60,9 +58,9 @@ class Carrier:
 
 
 def cube_at(
-    first: int, x: float = 0, y: float = 0, z: float = 0, turn: float = 0, size: float = CUBE
+    first: int, x: float = 0, y: float = 0, z: float = 0, size: float = CUBE
 ) -> Carrier:
-    """A cube of five tags.
+    """A cube of five tags, turned as the body is.
 
     Parameters
     ----------
@@ -70,13 +68,11 @@ def cube_at(
         Its tags are this and the next four.
     x, y, z : float
         Its middle in the frame of the body [m].
-    turn : float, default=0
-        By how much it is turned there about z [deg]: two sides of it should be seen.
     size : float, default=0.04
         Edges of the black squares; the cube is a quarter larger [m].
     """
     cube = {"cube": [*range(first, first + 5)], "size": size}
-    return Carrier(cube, rigid((0.0, 0.0, math.radians(turn)), (x, y, z)))
+    return Carrier(cube, rigid(np.zeros(3), (x, y, z)))
 
 
 def flat_at(

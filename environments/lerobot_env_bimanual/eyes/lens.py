@@ -82,7 +82,8 @@ class Lens:
 
     def __call__(self, ideal: Picture) -> Picture:
         """The picture (height, width, 3) of an ideal one that has ``size`` and ``fovy``."""
-        bent = cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR)
+        x, y = self._maps
+        bent = cv2.remap(ideal, x, y, cv2.INTER_LINEAR)
         size = self.camera.width, self.camera.height
         return np.asarray(cv2.resize(bent, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 

@@ -87,7 +87,7 @@ def recording(
     if codec not in CODECS:
         raise DataError(f"a codec is one of {list(CODECS)}, got {codec!r}")
     names, video = list(joint_names), CODECS[codec]
-    joints = {"dtype": "float32", "shape": (len(names),), "names": names}
+    joints: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
     joints |= {"info": {"units": list(units or ["rad"] * len(names))}}
     features: dict[str, Any] = {OBS_STATE: joints, ACTION: joints}
     for name, (width, height) in cameras.items():

@@ -48,7 +48,7 @@ def looking(eye: ArrayLike, at: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> A
     eye = np.asarray(eye, dtype=float)
     z = np.asarray(at, dtype=float) - eye
     z /= np.linalg.norm(z)
-    x = np.cross(z, up)
+    x = np.cross(z, np.asarray(up, dtype=float))
     x /= np.linalg.norm(x)
     return rigid(np.stack((x, np.cross(z, x), z), axis=1), eye)
 
