@@ -58,8 +58,7 @@ def chosen_views(cameras: str | Sequence[str]) -> dict[str, View]:
     UnknownNameError
         If there is no such camera.
     """
-    names = re.split(r"[\s,\[\]'\"]+", cameras) if isinstance(cameras, str) else cameras
-    names = [name for name in names if name]
+    names = re.findall(r"[\w.-]+", cameras) if isinstance(cameras, str) else cameras
     for name in names:
         if name not in VIEWS:
             raise UnknownNameError("camera", name, "the environments", VIEWS)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
-from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, TURN, cube_at, flat_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -63,8 +63,8 @@ class Handover(SuiteTask):
         "rest": 0.4,
     }  # fmt: skip
     carriers: ClassVar = {
-        "baton": cube_at(10, z=FOOT + CUBE_ROOM),
-        "stand": flat_at(20, 0.09, z=0.001),
+        "baton": cube_at(10, z=FOOT + CUBE_ROOM, turn=TURN),
+        "stand": flat_at(20, 0.09, 0.001),
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)

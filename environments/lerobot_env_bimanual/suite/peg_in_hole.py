@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
-from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, TURN, TURNED_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
@@ -82,7 +82,7 @@ class PegInHole(SuiteTask):
     }  # fmt: skip
     carriers: ClassVar = {
         "peg": cube_at(10, z=LENGTH + CUBE_ROOM),
-        "block": cube_at(20, WIDTH + CUBE_ROOM),
+        "block": cube_at(20, WIDTH + TURNED_ROOM, turn=TURN),
     }
     grasp, box, grip, wait = "close", AREA, GRIP, WAIT
     holds = (PEG, BLOCK)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
-from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, TURN, TURNED_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -87,7 +87,7 @@ class Pour(SuiteTask):
     }  # fmt: skip
     carriers: ClassVar = {
         "cup": cube_at(10, CUP + CUBE_ROOM),
-        "jug": cube_at(20, JUG + CUBE_ROOM, z=LOW),
+        "jug": cube_at(20, JUG + TURNED_ROOM, z=LOW, turn=TURN),
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)

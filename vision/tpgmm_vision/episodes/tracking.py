@@ -103,7 +103,8 @@ def track_lerobot(
             f"objects cannot be followed in episodes {episodes}: "
             f"{'; '.join(summed_up(problems))}. Nothing was written. Record them again, or "
             f"leave them out: lerobot-edit-dataset --repo_id {folder.name} --root {folder} "
-            f"--new_root NEW --operation.type delete_episodes --operation.episode_indices '{episodes}'"
+            "--new_root NEW --operation.type delete_episodes "
+            f"--operation.episode_indices '{episodes}'"
         )
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
