@@ -149,7 +149,7 @@ def calibrate_cell(
         Tags in hands, and those that stand still, by name.
     bases : sequence of str, default=()
         Beginnings of the names of links and joints of arms whose base is not known, such as
-        "right_".
+        ``"right_"``.
 
     Raises
     ------
