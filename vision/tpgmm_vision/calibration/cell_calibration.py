@@ -33,8 +33,8 @@ LEAST_PICTURES, FOLDS = 8, 5
 WRONG_TAG = 10.0
 #: Offsets that are known no better than this share of what was known before are not known.
 UNKNOWN_SHARE = 0.5
-#: The error between object and hand that a calibration may expect anywhere [m].
-LARGEST_EXPECTED = 0.01
+#: The error between object and hand that offsets and poses which are not known may add [m].
+LARGEST_EXPECTED = 0.003
 #: It is expected at so many postures, at most so far from the mean of those recorded [rad].
 ELSEWHERE, LIKELY_REACH = 50, 0.5
 #: Less than this is no step of a camera or a target [m, rad].
@@ -295,11 +295,13 @@ class _Task:
                 )  # fmt: skip
             except cv2.error:
                 continue
-            camera = rigid(turn, place) if np.isfinite(turn).all() else np.eye(4)
+            if not np.isfinite(place).all() or not np.linalg.det(turn) > 0.5:
+                continue
+            camera = rigid(turn, place)
             poses = hand_from_carrier @ camera @ camera_from_target
             target, _ = mean_pose(poses)
             error = float(np.median(np.linalg.norm(poses[:, :3, 3] - target[:3, 3], axis=1)))
-            if np.isfinite(place).all() and error < best:
+            if error < best:
                 best, found = error, (camera, target)
         if found is None:
             raise DataError(
