@@ -35,7 +35,9 @@ def away(cell, found, rng):
     true, distances = cell.base, []
     for name, (target, pose, link) in cell.targets.items():
         for camera, (place, carrier) in cell.cameras.items():
-            seen = inverse(cell.links(joints, carrier) @ place) @ cell.links(joints, link) @ pose
+            seen = (
+                inverse(cell.links(joints, carrier) @ place) @ cell.links(joints, link) @ pose
+            )
             cell.base = found.bases.get("right_", np.eye(4))
             said = cell.links(believed, carrier) @ found.cameras[camera] @ seen
             held = cell.links(believed, link) @ found.mounts[name]
@@ -122,7 +124,9 @@ def test_postures_that_do_not_tell_are_refused_with_what_is_missing():
     cell = so101_cell(1.0, rng)
     cell.middle, moving = cell.postures(1, rng)[0], np.array([1, 0, 0, 0, 0, 0])
     cell.reach = cell.reach * moving
-    with pytest.raises(DataError, match=r"no rotation .* turn shoulder_lift \(. deg\), elbow"):
+    with pytest.raises(
+        DataError, match=r"without rotation .* turn shoulder_lift \(. deg\), elbow"
+    ):
         calibrated(cell, rng)
     joints, seen = so101_cell(1.0, rng).recorded(N, rng)
     few = {"front": [one if k < 5 else Detections() for k, one in enumerate(seen["front"])]}

@@ -33,7 +33,9 @@ def test_rays_are_right_and_the_error_is_said(pictures):
 def test_what_is_missing_is_said(eye, pictures):
     rng, some = np.random.default_rng(0), dict(list(pictures.items())[:7])
     blank = {f"blank {k}.png": np.full((480, 640), 90, np.uint8) for k in range(3)}
-    with pytest.raises(DataError, match=r"7 of 10 .* there is none in \['blank 0.png', 'blank 1"):
+    with pytest.raises(
+        DataError, match=r"7 of 10 .* there is none in \['blank 0.png', 'blank 1"
+    ):
         calibrate_camera(some | blank, Board())
     with pytest.raises(DataError, match="one size"):
         calibrate_camera(some | {"small.png": np.zeros((240, 320), np.uint8)}, Board())
