@@ -283,7 +283,7 @@ class _Task:
     ) -> tuple[Array, Array]:
         """Poses of a camera in its carrier, and of a target in the hand."""
         found = list[tuple[float, Array, Array]]()
-        pairs = [one[:, :3, columns] for one in (hand_from_carrier, camera_from_target)
+        pairs = [list(one[:, :3, columns]) for one in (hand_from_carrier, camera_from_target)
                  for columns in (slice(3), 3)]  # fmt: skip
         for method in CLOSED_FORMS:
             with suppress(cv2.error):
