@@ -67,8 +67,8 @@ class CameraCalibration:
         fx, fy = self.camera.focal_length
         return (
             f"focal length {fx:.1f}, {fy:.1f} pixels; error on pictures left out "
-            f"{self.pixel_error:.2f} pixels, {2e3 * self.pixel_error / (fx + fy):.2f} mm at 1 m; "
-            f"from {len(self.pictures)} pictures"
+            f"{self.pixel_error:.2f} pixels, {2e3 * self.pixel_error / (fx + fy):.2f} mm at 1 "
+            f"m; from {len(self.pictures)} pictures"
         )
 
 
@@ -112,8 +112,8 @@ def calibrate_camera(
     tilt = float(np.sqrt(sides.var(axis=0).sum()))
     if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
         raise DataError(
-            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the board "
-            f"is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it by 30 "
+            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the "
+            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it by 30 "
             "deg and more to the left, to the right, up and down"
         )
     problems = []
@@ -169,13 +169,16 @@ def _check_covered(views: Views, size: Sequence[int]) -> None:
     fields = np.minimum(pixels / size * FIELDS, FIELDS - 1).astype(int).clip(0)
     covered = np.zeros((FIELDS, FIELDS), dtype=bool)
     covered[fields[:, 1], fields[:, 0]] = True
-    sides = zip(("top", "bottom", "left", "right"),
-                (covered[0], covered[-1], covered[:, 0], covered[:, -1]), strict=True)  # fmt: skip
-    bare = [name for name, side in sides if side.sum() < FIELDS / 2] or ["the corners"]
+    sides = covered[0], covered[-1], covered[:, 0], covered[:, -1]
+    names = "top", "bottom", "left", "right"
+    bare = [
+        name for name, side in zip(names, sides, strict=True) if side.sum() < FIELDS / 2
+    ] or ["the corners"]
     if covered.sum() < LEAST_COVERED:
         raise DataError(
-            f"the board was seen in {covered.sum()} of the picture's {FIELDS} x {FIELDS} fields, "
-            f"{LEAST_COVERED} are needed: take pictures of it near the edges: {', '.join(bare)}"
+            f"the board was seen in {covered.sum()} of the picture's {FIELDS} x {FIELDS} "
+            f"fields, {LEAST_COVERED} are needed: take pictures of it near the edges: "
+            f"{', '.join(bare)}"
         )
 
 

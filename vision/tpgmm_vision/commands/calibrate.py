@@ -141,15 +141,19 @@ def cell(
         for k, (name, entry) in enumerate(entries.items())
     }
     links = {mount.link for mount in mounts.values()} | {one.link for one in cameras.values()}
-    wanted = sorted({*(described.link or ()), *links} - {None})  # type: ignore[type-var]
-    robot = replace(described, link=wanted).read()
-    if robot is None or not cameras:
+    wanted = {*(described.link or ()), *(link for link in links if link)}
+    robot = replace(described, link=sorted(wanted)).read()
+    if robot is None or not cameras or not mounts:
         raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
-                        "(tpgmm calibrate camera)")  # fmt: skip
+                        "(tpgmm calibrate camera) and tags in its hand (--hand)")  # fmt: skip
+    if content.get("joints", names := list(robot.joint_names)) != names:
+        raise DataError(f"{cell} is of a robot with joints {content['joints']}, this one has "
+                        f"{names}: give another --cell")  # fmt: skip
+    families = {mount.target.family for mount in mounts.values()}
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
     recording = reading.opened(path, robot, frames={})
     joints, pictures = slow_postures(recording, {n: one.key for n, one in cameras.items()})
-    find = TagDetector()
+    find = TagDetector(*families)
     shown: dict[tuple[str, int], Any] = {}
     seen: dict[str, list[Detections]] = {name: [] for name in cameras}
     with Progress(transient=True) as bar:
@@ -160,14 +164,14 @@ def cell(
                 seen[name].append(find(image))
     result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
     for name, pose in result.cameras.items():
-        entry = {"pose": pose_content(pose), "report": str(result).splitlines()[0]}
-        content["cameras"][name].update(entry)
+        report = str(result).splitlines()[0]
+        content["cameras"][name] |= {"pose": pose_content(pose), "report": report}
     for name in check or ():
         name = name.partition("=")[0]
         entry = {"target": entries[name], "pose": pose_content(result.mounts[name])}
         content.setdefault("checks", {})[name] = entry
     offsets = result.joint_offsets.items()
-    content["joints"] = list(robot.joint_names)
+    content["joints"] = names
     content["joint_offsets"] = {n: round(v, 6) for n, v in offsets if n not in result.unknown}
     out.mkdir(parents=True, exist_ok=True)
     for (name, k), image in shown.items():
