@@ -95,12 +95,16 @@ class SimulatedCell:
         """
         side = rng.choice([-1.0, 1.0], joints.shape)
         if self.gravity:
-            rise = self.robot.state(torch.as_tensor(joints)).jacobians[..., 2, :].sum(-2).numpy()
+            rise = (
+                self.robot.state(torch.as_tensor(joints)).jacobians[..., 2, :].sum(-2).numpy()
+            )
             side = np.where(np.abs(rise) > 0.01, np.sign(rise), side)
         side *= self.backlash / 2
         return joints - self.offsets + side + rng.normal(0, self.joint_noise, joints.shape)
 
-    def corners(self, joints: Array, rng: np.random.Generator) -> dict[str, list[dict[int, Array]]]:
+    def corners(
+        self, joints: Array, rng: np.random.Generator
+    ) -> dict[str, list[dict[int, Array]]]:
         """By camera, the corners of tags at joints."""
         found: dict[str, list[dict[int, Array]]] = {}
         held = [(t, self.links(joints, link) @ pose) for t, pose, link in self.targets.values()]
@@ -110,7 +114,9 @@ class SimulatedCell:
                 {
                     number: pixels + rng.normal(0, self.pixels, (4, 2))
                     for target, poses in held
-                    for number, pixels in visible(self.camera, back[k] @ poses[k], target).items()
+                    for number, pixels in visible(
+                        self.camera, back[k] @ poses[k], target
+                    ).items()
                 }
                 for k in range(len(joints))
             ]
@@ -120,16 +126,21 @@ class SimulatedCell:
         """Joints at which each camera sees a tag, and hands are above the table."""
         found: list[Array] = []
         while len(found) < n:
-            joints = self.middle + rng.uniform(-self.reach, self.reach, (64, self.robot.n_joints))
+            joints = self.middle + rng.uniform(
+                -self.reach, self.reach, (64, self.robot.n_joints)
+            )
             seen = self.corners(joints, rng)
             high = np.all([self.links(joints, l)[:, 2, 3] > 0.03 for l in self.robot.links], 0)
             found += [
-                joints[k] for k in range(64)
+                joints[k]
+                for k in range(64)
                 if high[k] and all(len(one[k]) >= least for one in seen.values())
             ]
         return np.array(found[:n])
 
-    def recorded(self, n: int, rng: np.random.Generator) -> tuple[Array, dict[str, list[Detections]]]:
+    def recorded(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Array, dict[str, list[Detections]]]:
         joints = self.postures(n, rng)
         seen = {k: [Detections(c) for c in v] for k, v in self.corners(joints, rng).items()}
         return self.measured(joints, rng), seen
@@ -189,7 +200,9 @@ def two_arm_cell(offset: float, rng: np.random.Generator, **settings: Any) -> Si
     )  # fmt: skip
 
 
-def drawn(camera: Camera, tags: dict[int, Array], rng: np.random.Generator) -> NDArray[np.uint8]:
+def drawn(
+    camera: Camera, tags: dict[int, Array], rng: np.random.Generator
+) -> NDArray[np.uint8]:
     """A picture of tags whose corners are given, with noise."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     size = camera.width * FINE, camera.height * FINE
@@ -219,7 +232,11 @@ def record(root: Path, cell: SimulatedCell, postures: Array, rng: np.random.Gene
     shape = cell.camera.height, cell.camera.width, 3
     video = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
     keys = {name: f"observation.images.{name}" for name in cell.cameras}
-    features = {"observation.state": joints, "action": joints, **dict.fromkeys(keys.values(), video)}
+    features = {
+        "observation.state": joints,
+        "action": joints,
+        **dict.fromkeys(keys.values(), video),
+    }
     made = LeRobotDataset.create(
         "test/cell", 10, features, root=root, robot_type="so101_follower", use_videos=True,
         rgb_encoder=RGBEncoderConfig(vcodec="h264"),
@@ -232,7 +249,9 @@ def record(root: Path, cell: SimulatedCell, postures: Array, rng: np.random.Gene
     measured[1::4] = true[1::4]
     seen = cell.corners(true, rng)
     for k, row in enumerate(np.degrees(measured).astype(np.float32)):
-        pictures = {keys[name]: drawn(cell.camera, found[k], rng) for name, found in seen.items()}
+        pictures = {
+            keys[name]: drawn(cell.camera, found[k], rng) for name, found in seen.items()
+        }
         made.add_frame({"observation.state": row, "action": row, "task": "wave", **pictures})
     made.save_episode()
     made.finalize()
