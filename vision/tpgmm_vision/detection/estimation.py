@@ -35,7 +35,7 @@ LEAST_EVIDENCE = 20.0
 #: square: in standard deviations, and as a share of an edge, by which cubes are glued badly.
 MOST_MISFIT, CRAFT = 5.0, 0.015
 #: A pose less certain than this is not valid: standard deviation [m] and [rad].
-MOST_UNCERTAIN = 0.005, np.radians(3)
+MOST_UNCERTAIN = 0.003, np.radians(3)
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,7 @@ class _Problem:
         for _ in range(STEPS):
             scale = np.diag(np.diag(information)) * damping + 1e-6 * np.eye(6)
             step = -np.linalg.solve(information + scale, gradient)
-            step *= min(1, 0.5 / float(np.abs(step).max()))
+            step *= 0.5 / max(0.5, float(np.abs(step).max()))
             turn = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
             new = rigid(turn, pose[:3, 3] + step[:3])
             found = self.system(new, known)
@@ -319,13 +319,13 @@ class _Problem:
         reason, alternative = "", None
         if self.contradicts(fit):
             reason = "the corners of its tag fit no pose"
-        elif fit.second and fit.second.cost - fit.cost < LEAST_EVIDENCE * max(misfit, 1):
-            reason, alternative = "two poses explain what is seen", fit.second.pose
         elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
             reason = (
                 f"it is uncertain by {1e3 * position:.0f} mm and {np.degrees(turn):.0f} deg: "
                 "its tags are too small in the picture"
             )
+        elif fit.second and fit.second.cost - fit.cost < LEAST_EVIDENCE * max(misfit, 1):
+            reason, alternative = "two poses explain what is seen", fit.second.pose
         left = self.residual(fit.pose)
         return PoseEstimate(
             fit.pose, covariance, left, not reason, reason, self.tags, alternative

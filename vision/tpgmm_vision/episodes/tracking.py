@@ -37,7 +37,7 @@ from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import EpisodePictures
 from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transformed
-from tpgmm_vision.sources import ObservedPose, pose_source
+from tpgmm_vision.sources import pose_source
 
 __all__ = ["track_lerobot"]
 
@@ -139,13 +139,6 @@ def _offsets(
     return declared
 
 
-def _repeated(now: ObservedPose, last: ObservedPose | None) -> bool:
-    """Whether a source repeats for a moment what it measured before, less certain now."""
-    if last is None or not np.array_equal(now.pose, last.pose):
-        return False
-    return bool(np.trace(now.covariance) > np.trace(last.covariance))
-
-
 class _Tracker:
     """Follows the objects of a cell through episodes."""
 
@@ -192,20 +185,17 @@ class _Tracker:
         self, rows: EpisodeRows, joints: Sequence[Mapping[str, float]], report: EpisodeReport
     ) -> list[dict[str, dict[int, Array]]]:
         """Put what the source measures into tracks; corners that it saw, by row and camera."""
-        last, corners = dict[str, ObservedPose](), list[dict[str, dict[int, Array]]]()
+        corners = list[dict[str, dict[int, Array]]]()
         self.source.reset()
         for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
             now, source = float(rows.time[row]), self.source
             for name, one in source.poses(images, joints[row], now).items():
                 track = report.tracks.setdefault(name, Track(rows.time))
                 track.reasons[row] = one.reason
-                if one.valid and not _repeated(one, last.get(name)):
-                    last[name], track.poses[row] = one, pose_matrix(one.pose)
+                if one.valid:
                     estimate = getattr(source, "estimates", {}).get(name)
-                    track.seen[row], track.residuals[row] = (
-                        True,
-                        getattr(estimate, "residual", 0),
-                    )
+                    track.poses[row], track.seen[row] = pose_matrix(one.pose), True
+                    track.residuals[row] = getattr(estimate, "residual", 0)
             if source.problem:
                 raise DatasetError(f"at {now:.2f} s {source.problem}", episode=report.index)
             corners.append({
