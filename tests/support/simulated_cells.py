@@ -130,7 +130,8 @@ class SimulatedCell:
                 -self.reach, self.reach, (64, self.robot.n_joints)
             )
             seen = self.corners(joints, rng)
-            high = np.all([self.links(joints, one)[:, 2, 3] > 0.03 for one in self.robot.links], 0)
+            heights = [self.links(joints, one)[:, 2, 3] for one in self.robot.links]
+            high = (np.array(heights) > 0.03).all(0)
             found += [
                 joints[k]
                 for k in range(64)
