@@ -79,7 +79,7 @@ def test_a_flat_tag_is_ambiguous_from_the_front_and_never_flipped_where_it_is_va
             np.radians(tilt) * np.append(axis / np.linalg.norm(axis), 0)
         )
         pose = EYE @ rigid(turn.as_matrix() @ np.diag([1.0, -1, -1]), (0.0, 0.0, 1.0))
-        found = estimate_pose([seen(target, pose, rng, std=0.1)], target)
+        found = estimate_pose([seen(target, pose, rng, std=0.05)], target)
         if found.valid:
             assert angle_between(found.pose, pose) < np.radians(15)
         elif found.alternative is not None:

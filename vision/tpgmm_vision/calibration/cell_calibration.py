@@ -45,7 +45,7 @@ LEAST_STEP = 0.003, np.radians(0.5)
 HARDLY = np.radians(15.0)
 #: By how much the logarithm of the likelihood must rise for a cause to be believed: of a scale,
 #: and of a pose that changed on the way, which can do so at any picture.
-SCALE_EVIDENCE, STEP_EVIDENCE = 6.0, 25.0
+SCALE_EVIDENCE, STEP_EVIDENCE = 8.0, 25.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,8 +113,8 @@ def calibrate_camera(
     if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
         raise DataError(
             f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the "
-            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it by 30 "
-            "deg and more to the left, to the right, up and down"
+            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it "
+            "by 30 deg and more to the left, to the right, up and down"
         )
     problems = []
     if without or blurred:

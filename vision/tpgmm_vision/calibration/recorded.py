@@ -19,8 +19,9 @@ from tpgmm_vision.poses import Array
 
 __all__ = ["board_pictures", "slow_postures", "spread"]
 
-#: Pictures of a video that are looked at, and postures of a recording.
-FRAMES, POSTURES = 200, 60
+#: Pictures of a video that are looked at, and postures of a recording; of so many at least the
+#: robot may move faster than it should.
+FRAMES, POSTURES, LEAST_POSTURES = 200, 60, 15
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
 SLOW = 0.2
@@ -109,7 +110,7 @@ def slow_postures(
         for table, one in zip(tables, rows, strict=True)
     ])  # fmt: skip
     joints = np.concatenate(tables)
-    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[min(most, len(speed)) - 1]))
+    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[: min(LEAST_POSTURES, most)][-1]))
     chosen = slow[spread(joints[slow], most)].tolist()
 
     def pictures() -> Iterator[tuple[int, dict[str, Picture]]]:

@@ -153,7 +153,7 @@ def cell(
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
     recording = reading.opened(path, robot, frames={})
     joints, pictures = slow_postures(recording, {n: one.key for n, one in cameras.items()})
-    find = TagDetector(*families)
+    find = TagDetector(families.pop())
     shown: dict[tuple[str, int], Any] = {}
     seen: dict[str, list[Detections]] = {name: [] for name in cameras}
     with Progress(transient=True) as bar:
