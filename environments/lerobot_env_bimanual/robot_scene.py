@@ -117,7 +117,7 @@ def add_weld(spec: Any, hand: str, thing: str) -> Any:
 
 
 class RobotScene(ABC):
-    """A simulated world with the robot in it, whose joints come first.
+    """A simulated world with the robot in it.
 
     Parameters
     ----------
@@ -134,6 +134,9 @@ class RobotScene(ABC):
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._n = self.model.nu
+        driven = self.model.actuator_trnid[:, 0]
+        # of what is driven, among all positions and velocities
+        self._places, self._dofs = self.model.jnt_qposadr[driven], self.model.jnt_dofadr[driven]
 
     @property
     @abstractmethod
@@ -155,7 +158,7 @@ class RobotScene(ABC):
     @property
     def joints(self) -> NDArray[np.float64]:
         """Joint positions, shape (n_joints,) [rad]."""
-        return self.data.qpos[: self._n].copy()
+        return np.asarray(self.data.qpos[self._places])
 
     def follow(
         self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
@@ -169,11 +172,11 @@ class RobotScene(ABC):
         torques : ndarray of shape (n, n_joints), optional
             From outside, during each time step [N m].
         """
-        model, data, n = self.model, self.data, self._n
+        model, data = self.model, self.data
         control = self._controls(references[1:], np.diff(references, axis=0) / TIMESTEP)
         for i in range(len(control)):
             if torques is not None:
-                data.qfrc_applied[:n] = torques[i]
+                data.qfrc_applied[self._dofs] = torques[i]
             self._step(control[i])
         if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
             raise DataError(f"the simulation diverges at {references[-1].tolist()}")
@@ -186,7 +189,7 @@ class RobotScene(ABC):
         # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
         # is its damping, the joint's own and the control's: so much it has to be led
         model = self.model
-        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
+        damping = model.dof_damping[self._dofs] - model.actuator_biasprm[:, 2]
         return references + damping / model.actuator_gainprm[:, 0] * speeds
 
     def _step(self, control: NDArray[np.float64]) -> None:
@@ -197,7 +200,7 @@ class RobotScene(ABC):
         """Stand still, as it is."""
         data = self.data
         data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
-        data.ctrl[:] = data.qpos[: self._n]
+        data.ctrl[:] = self.joints
         mujoco.mj_forward(self.model, data)
 
     def _attach(self, weld: int, hand: int, thing: int) -> None:
