@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_env_bimanual.aloha.robot import JOINTS, OBJECTS
 from lerobot_env_bimanual.control_rate import rate_processors
@@ -88,6 +88,24 @@ class _ControlledEnvConfig(_StateEnvConfig):
     pushes: bool = False
     noise: float = 0.0
     condition: str = NOMINAL
+    cameras: str = ""
+    camera_width: int = 640
+    camera_height: int = 480
+    observe_objects: bool = True
+
+    def __post_init__(self) -> None:
+        self._look()
+
+    def _look(self) -> None:
+        """Make the features those of the cameras, and of what else is observed."""
+        from lerobot_env_bimanual.eyes.views import chosen_views
+
+        for name in chosen_views(self.cameras):
+            shape = (self.camera_height, self.camera_width, 3)
+            self.features[f"pixels/{name}"] = PolicyFeature(FeatureType.VISUAL, shape)
+            self.features_map[f"pixels/{name}"] = f"{OBS_IMAGES}.{name}"
+        if not self.observe_objects:
+            self.features.pop("environment_state", None)
 
 
 class _TaskEnvConfig(_StateEnvConfig):
@@ -122,7 +140,8 @@ class BottleShakingConfig(_ControlledEnvConfig):
     ----------
     task, features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot.
-    fps, mode, episode_length, pushes, noise, track, condition, frequency, amplitude
+    fps, mode, episode_length, pushes, noise, track, condition, cameras, camera_width, \
+    camera_height, observe_objects, frequency, amplitude
         Options of
         :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`; its own
         defaults where None.
@@ -146,8 +165,8 @@ class BottleTorqueConfig(BottleShakingConfig):
     Parameters
     ----------
     task, features, features_map, max_parallel_tasks, disable_env_checker, fps, mode, \
-    episode_length, pushes, noise, track, condition, frequency, amplitude, render_mode, \
-    render_width, render_height
+    episode_length, pushes, noise, track, condition, cameras, camera_width, camera_height, \
+    observe_objects, frequency, amplitude, render_mode, render_width, render_height
         As of :class:`BottleShakingConfig`.
     control, obstacle
         Options of
@@ -160,6 +179,7 @@ class BottleTorqueConfig(BottleShakingConfig):
     obstacle: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.control == "impedance":
             self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(51,))
 
@@ -173,7 +193,8 @@ class CarryAndPutConfig(_ControlledEnvConfig):
     ----------
     task, features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot.
-    fps, mode, episode_length, pushes, noise, condition
+    fps, mode, episode_length, pushes, noise, condition, cameras, camera_width, \
+    camera_height, observe_objects
         Options of
         :class:`~lerobot_env_bimanual.bottle.carrying.CarryAndPutEnv`; its own
         defaults where None.
@@ -199,7 +220,8 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
         One of :data:`~lerobot_env_bimanual.suite.names.ROBOTS`.
     features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot; the features follow from task and robot.
-    fps, episode_length, pushes, noise, condition
+    fps, episode_length, pushes, noise, condition, cameras, camera_width, camera_height, \
+    observe_objects
         Options of :class:`~lerobot_env_bimanual.suite.env.SuiteEnv`; its own
         defaults where None.
     render_mode, render_width, render_height
@@ -215,6 +237,7 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
         self._observe(SUITE, ROBOTS[self.robot])
+        super().__post_init__()
 
 
 @EnvConfig.register_subclass("aloha_state")

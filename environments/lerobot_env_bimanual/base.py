@@ -13,7 +13,8 @@ from tpgmm_torch.exceptions import DataError, ShapeError
 
 __all__ = ["Observation", "StateEnv", "finite_vector"]
 
-Observation = dict[str, NDArray[np.float64]]
+#: Arrays of numbers; ``pixels`` are pictures by the names of cameras.
+Observation = dict[str, Any]
 
 
 class StateEnv(gym.Env[Observation, NDArray[np.float32]]):

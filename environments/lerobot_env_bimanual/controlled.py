@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import zlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -20,6 +21,10 @@ from lerobot_env_bimanual.disturbances import (
     generators,
     parse_condition,
 )
+from lerobot_env_bimanual.eyes.carriers import Carrier
+from lerobot_env_bimanual.eyes.lens import Imperfections, usual_camera
+from lerobot_env_bimanual.eyes.rig import Rig
+from lerobot_env_bimanual.eyes.views import CHECK, chosen_views
 from lerobot_env_bimanual.robot_scene import CAMERA, RobotScene
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Robot
@@ -70,9 +75,17 @@ class ControlledEnv(StateEnv):
         :func:`~lerobot_env_bimanual.disturbances.parse_condition` takes it:
         ``"stopped-3"``, ``"moved+pose-noise"``. Its moments are drawn from the seed; an episode
         becomes longer by the delay that it means.
+    cameras : str or sequence of str, default=()
+        Those of :data:`~lerobot_env_bimanual.eyes.views.VIEWS` whose pictures are observed, as
+        ``pixels``: ``"front"``, ``"front,side"``. Objects then carry tags, of which what is
+        simulated does not know.
+    camera_width, camera_height : int, default=640, 480
+        Of these pictures.
+    observe_objects : bool, default=True
+        Whether the objects' poses are observed; without them, a policy has to look.
     render_mode : {"rgb_array"}, optional
     render_width, render_height : int
-        Of the picture.
+        Of the picture that :meth:`render` gives.
 
     Attributes
     ----------
@@ -84,6 +97,9 @@ class ControlledEnv(StateEnv):
     DataError
         If an option is not one of the above.
     """
+
+    #: The tags of the objects, by their names.
+    carriers: ClassVar[Mapping[str, Carrier]] = {}
 
     _start: Start
     _joints: NDArray[np.float64]
@@ -105,6 +121,10 @@ class ControlledEnv(StateEnv):
         noise: float = 0.0,
         track: bool = False,
         condition: str | Sequence[Disturbance] = NOMINAL,
+        cameras: str | Sequence[str] = (),
+        camera_width: int = 640,
+        camera_height: int = 480,
+        observe_objects: bool = True,
         render_mode: str | None = None,
         render_width: int = 320,
         render_height: int = 240,
@@ -125,13 +145,63 @@ class ControlledEnv(StateEnv):
         # pushes and noise can lead a little beyond the joints' ranges
         joints = spaces.Box(self._lower - 0.5, self._upper + 0.5, dtype=np.float64)
         reach = np.tile(RANGE, len(scene.objects))
-        self.observation_space = spaces.Dict(
-            agent_pos=joints,
-            environment_state=spaces.Box(-reach, reach, dtype=np.float64),
-            timestamp=spaces.Box(0.0, 3 * steps / fps, (1,), dtype=np.float64),
-        )
+        observed: dict[str, spaces.Space[Any]] = {"agent_pos": joints}
+        self.observe_objects = observe_objects
+        if observe_objects:
+            observed["environment_state"] = spaces.Box(-reach, reach, dtype=np.float64)
+        observed["timestamp"] = spaces.Box(0.0, 3 * steps / fps, (1,), dtype=np.float64)
+        self._rig = None
+        if views := chosen_views(cameras):
+            shape, size = (camera_height, camera_width, 3), (camera_width, camera_height)
+            picture = spaces.Box(0, 255, shape, dtype=np.uint8)
+            observed["pixels"] = spaces.Dict(dict.fromkeys(views, picture))
+            self._rig = self.rig(cameras, size)
+        self.observation_space = spaces.Dict(observed)
         self._live = track or any(part.live for part in self.disturbances)
         self._steps = steps  # no episode is going on
+
+    def rig(
+        self,
+        cameras: str | Sequence[str],
+        size: tuple[int, int] = (640, 480),
+        imperfections: Imperfections | None = None,
+    ) -> Rig:
+        """Cameras before the scene, and tags on its objects and beside the table.
+
+        Parameters
+        ----------
+        cameras : str or sequence of str
+            As the option.
+        size : (int, int)
+            Width and height of their pictures.
+        imperfections : Imperfections, optional
+            What spoils them.
+        """
+        return Rig(
+            self._scene,
+            chosen_views(cameras),
+            {**CHECK, **self.carriers},
+            camera=usual_camera(*size),
+            imperfections=imperfections,
+        )
+
+    def cell(self) -> dict[str, Any]:
+        """The true cell file of the environment with its cameras.
+
+        Raises
+        ------
+        DataError
+            If it has no cameras.
+        """
+        if self._rig is None:
+            raise DataError("the environment has no cameras: make it with cameras='front'")
+        return {**self._rig.content(), "joints": list(self.joint_names)}
+
+    def close(self) -> None:
+        """Free what the graphics library holds."""
+        if self._rig is not None:
+            self._rig.close()
+        super().close()
 
     def _check_options(self) -> None:
         if self.fps not in range(10, 1001) or 1000 % self.fps:
@@ -204,6 +274,8 @@ class ControlledEnv(StateEnv):
             for part, rng in zip(self.disturbances, self._rngs, strict=True)
         )
         self._sag = sum(part.sag(len(self.joint_names)) for part in self._drawn)
+        # of the pictures: whether there are some changes no other random number
+        self._grain = np.random.default_rng(zlib.crc32(start.joints.tobytes()))
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Any]] = []
         self._shown = self._seen = self._perceived(start.misperception.reshape(-1, 6))
@@ -354,11 +426,12 @@ class ControlledEnv(StateEnv):
         for part, rng in zip(self._drawn, self._rngs, strict=True):
             shown = part.seen(shown, self._shown, self._time, rng)
         self._shown = shown
-        return {
-            "agent_pos": joints,
-            "environment_state": shown.copy(),
-            "timestamp": np.array([self._time]),
-        }
+        seen: Observation = {"agent_pos": joints, "timestamp": np.array([self._time])}
+        if self.observe_objects:
+            seen["environment_state"] = shown.copy()
+        if self._rig is not None:
+            seen["pixels"] = self._rig.pictures(self._grain)
+        return seen
 
     def _perceived(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
         """The objects' poses with errors given in standard deviations (n_objects, 6)."""

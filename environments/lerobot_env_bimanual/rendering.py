@@ -84,10 +84,19 @@ class Renderer:
         self._camera.fixedcamid = model.camera(camera).id
         self._view = mujoco.MjrRect(0, 0, width, height)
 
-    def __call__(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """A picture (height, width, 3), black and small where nothing can be drawn."""
+    def __call__(self, data: mujoco.MjData, camera: str | None = None) -> NDArray[np.uint8]:
+        """A picture (height, width, 3), black and small where nothing can be drawn.
+
+        Parameters
+        ----------
+        data : mujoco.MjData
+        camera : str, optional
+            Another camera of the model, from now on.
+        """
         if self._context is None:
             return np.zeros(BLANK, np.uint8)
+        if camera is not None:
+            self._camera.fixedcamid = self._model.camera(camera).id
         self._context.make_current()
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(

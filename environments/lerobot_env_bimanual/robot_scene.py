@@ -126,12 +126,14 @@ class RobotScene(ABC):
 
     Attributes
     ----------
+    spec : mujoco.MjSpec
+        What the model was compiled of.
     model : mujoco.MjModel
     data : mujoco.MjData
     """
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
-        self.model = spec.compile()
+        self.spec, self.model = spec, spec.compile()
         self.data = mujoco.MjData(self.model)
         self._n = self.model.nu
         driven = self.model.actuator_trnid[:, 0]

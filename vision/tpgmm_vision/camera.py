@@ -64,11 +64,15 @@ class Camera:
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (n, 2) of points (n, 3) in the camera's frame [m]."""
+        return self.projected(points)[0]
+
+    def projected(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Pixels (n, 2) of points (n, 3), and how they move with the points (n, 2, 3)."""
         zero, points = np.zeros(3), np.asarray(points, dtype=float).reshape(-1, 1, 3)
-        pixels = cv2.projectPoints(points, zero, zero, self.matrix, np.array(self.distortion))[
-            0
-        ]
-        return np.asarray(pixels.reshape(-1, 2), dtype=float)
+        lens = np.array(self.distortion)
+        pixels, rates = cv2.projectPoints(points, zero, zero, self.matrix, lens)
+        moved = rates[:, 3:6].reshape(-1, 2, 3)
+        return np.asarray(pixels.reshape(-1, 2), dtype=float), np.asarray(moved, dtype=float)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Where the rays of pixels (n, 2) meet the plane z = 1: x and y (n, 2)."""

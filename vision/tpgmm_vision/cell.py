@@ -225,19 +225,30 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
         "joint_offsets": lambda entry: entry.number(),
     }
     root = _Entry(content, where)
-    root.allow(*parts)
-    made = {
+    root.allow(*parts, "joints", "source")
+    made: dict[str, Any] = {
         part: {name: make(one) for name, one in root.items(part)}
         for part, make in parts.items()
     }
-    cell = Cell(**made, content=content)
+    joints, source = root.get("joints"), root.get("source")
+    cell = Cell(
+        **made,
+        joints=() if joints is None else joints.texts(),
+        source="tags" if source is None else source.text(),
+        content=content,
+    )
+    if joints is not None and (extra := cell.joint_offsets.keys() - set(cell.joints)):
+        raise DataError(
+            f"{where}: joint_offsets of {sorted(extra)}, which are not among joints"
+        )
     _check_unique(cell, where)
     return cell
 
 
 def _check_unique(cell: Cell, where: str) -> None:
     """Each tag and each picture belongs to one entry."""
-    targets = [*cell.objects.items(), *cell.checks.items()]
+    targets: list[tuple[str, CellObject | CellCheck]] = list(cell.objects.items())
+    targets += cell.checks.items()
     owners: dict[tuple[str, int], str] = {}
     for name, one in targets:
         for number in one.target.corners:
@@ -285,12 +296,10 @@ class _Entry:
         return [(key, _Entry(one, f"{found.where}: {key}")) for key, one in found.value.items()]
 
     def numbers(self, n: int) -> list[float]:
-        """So many finite numbers."""
+        """A list of ``n`` finite numbers."""
         values = self.value if isinstance(self.value, list | tuple) else [self.value]
-        number = all(
-            isinstance(one, int | float) and not isinstance(one, bool) for one in values
-        )
-        if not number or len(values) != n or not all(map(math.isfinite, values)):
+        plain = all(type(one) in (int, float) for one in values)
+        if not plain or len(values) != n or not all(map(math.isfinite, values)):
             wanted = f"{n} finite numbers" if n > 1 else "a finite number"
             raise DataError(f"{self.where} is {wanted}, got {self.value!r}")
         return [float(one) for one in values]
@@ -343,7 +352,10 @@ def _camera(entry: _Entry) -> CellCamera:
         raise DataError(f"{entry.where}: {error}") from error
     pose, link = entry.get("pose"), entry.get("link")
     return CellCamera(
-        camera, entry.need("key").text(), pose and pose.pose(), link and link.text()
+        camera,
+        entry.need("key").text(),
+        None if pose is None else pose.pose(),
+        None if link is None else link.text(),
     )
 
 
@@ -354,7 +366,7 @@ def _object(entry: _Entry) -> CellObject:
         _target(entry.need("target")),
         np.eye(4) if pose is None else pose.pose(),
         upright is not None and upright.flag(),
-        height and height.number(),
+        None if height is None else height.number(),
     )
 
 

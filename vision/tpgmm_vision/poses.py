@@ -37,10 +37,9 @@ def rigid(rotation: ArrayLike, position: ArrayLike) -> Array:
         [m]
     """
     pose, rotation = np.eye(4), np.asarray(rotation, dtype=float)
-    matrix = (
-        rotation if rotation.ndim == 2 else Rotation.from_rotvec(rotation.ravel()).as_matrix()
-    )
-    pose[:3, :3], pose[:3, 3] = matrix, np.ravel(position)
+    if rotation.shape != (3, 3):
+        rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
+    pose[:3, :3], pose[:3, 3] = rotation, np.ravel(position)
     return pose
 
 

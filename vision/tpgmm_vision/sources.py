@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_vision.poses import Array
 
-__all__ = ["SOURCES", "ObservedPose", "PoseSource"]
+__all__ = ["SOURCES", "ObservedPose", "PoseSource", "pose_source"]
 
 #: Group of entry points: functions ``make(cell, robot) -> PoseSource`` by name.
 SOURCES = "tpgmm.pose_sources"
+#: The one of this package.
+TAGS = EntryPoint("tags", "tpgmm_vision.detection.tag_source:TagSource", SOURCES)
 
 
 class ObservedPose(NamedTuple):
@@ -39,7 +43,16 @@ class ObservedPose(NamedTuple):
 
 
 class PoseSource(Protocol):
-    """Finds the poses of objects in pictures, or elsewhere."""
+    """Finds the poses of objects in pictures, or elsewhere.
+
+    Attributes
+    ----------
+    problem : str
+        What makes all poses wrong, such as a camera that was moved; the robot has to stop as
+        long as it is not empty.
+    """
+
+    problem: str
 
     def reset(self) -> None:
         """Forget what was seen: another episode begins."""
@@ -62,3 +75,33 @@ class PoseSource(Protocol):
             When they were taken [s].
         """
         ...
+
+
+def pose_source(cell: Any, robot: Any = None) -> PoseSource:
+    """The source of poses that a cell names.
+
+    Parameters
+    ----------
+    cell : Cell
+    robot : Kinematics, optional
+        Needed where a camera is on a link.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none of that name.
+    DependencyError
+        If it cannot be loaded.
+    """
+    known = {TAGS.name: TAGS} | {entry.name: entry for entry in entry_points(group=SOURCES)}
+    if cell.source not in known:
+        raise UnknownNameError("source", cell.source, "what is installed", known)
+    try:
+        make = known[cell.source].load()
+    except Exception as error:  # whatever is wrong with it
+        raise DependencyError(
+            f"{cell.source!r}, a plugin in {SOURCES!r}, cannot be loaded: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    source: PoseSource = make(cell, robot)
+    return source

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import PUT_FIGURES, Closing, successful
-from lerobot_env_bimanual.bottle.scene import Snapshot, TrayScene
+from lerobot_env_bimanual.bottle.scene import CARRIERS, Snapshot, TrayScene
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.carrying import SLIDE, TASK, CarryAndPut, slide
@@ -82,6 +82,7 @@ class CarryAndPutEnv(BottleEnv):
     task = TASK
     task_description = "take the bottle with both hands and put it on the tray"
     _scene: TrayScene
+    carriers: ClassVar = CARRIERS
 
     def __init__(self, **options: Any) -> None:
         super().__init__(TrayScene(), DURATION, COURSE, track=True, **options)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.measures import Closing
-from lerobot_env_bimanual.bottle.scene import BottleScene, Snapshot
+from lerobot_env_bimanual.bottle.scene import CARRIERS, BottleScene, Snapshot
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course, displaced
 from lerobot_env_bimanual.start import Start
@@ -37,6 +37,7 @@ class BottleEnv(ControlledEnv):
     """
 
     _scene: BottleScene
+    carriers: ClassVar = {"bottle": CARRIERS["bottle"]}
 
     def __init__(
         self, scene: BottleScene, duration: float, course: Course, **options: Any

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
 from lerobot_env_bimanual.robot_scene import (
     BOX,
     CYLINDER,
@@ -28,8 +29,20 @@ from lerobot_env_bimanual.robot_scene import (
 )
 from tpgmm_datasets.bottle.skill import FOOT, GRASP_POINT, HANDS
 
-__all__ = ["FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "TrayScene", "bottle_spec"]
+__all__ = [
+    "CARRIERS",
+    "FOOT",
+    "TABLE_LOW",
+    "BottleScene",
+    "Snapshot",
+    "TrayScene",
+    "bottle_spec",
+]
 
+#: Height of the cap's top above the bottle's origin [m], on which a cube of tags stands; a tag
+#: lies before the tray.
+CAP = FOOT + 0.062
+CARRIERS = {"bottle": cube_at(10, z=CAP + CUBE_ROOM), "tray": flat_at(20, 0.13, z=0.001)}
 #: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
 #: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2

@@ -82,6 +82,7 @@ class SuiteEnv(ControlledEnv):
 
     def __init__(self, task: str, robot: str = UPPER_BODY, **options: Any) -> None:
         self._task = suite_task(task, robot)
+        self.carriers = self._task.carriers  # type: ignore[misc]
         condition = options.get("condition", NOMINAL)
         if any(map(_skips, parse_condition(condition))):
             raise DataError(

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -61,6 +62,10 @@ class Handover(SuiteTask):
         "pass": 0.8, "leave": 1.0, "carry": 2.0, "lower": 1.2, "open": 0.8, "away": 1.0,
         "rest": 0.4,
     }  # fmt: skip
+    carriers: ClassVar = {
+        "baton": cube_at(10, z=FOOT + CUBE_ROOM),
+        "stand": flat_at(20, 0.09, z=0.001),
+    }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
     figures: ClassVar = {

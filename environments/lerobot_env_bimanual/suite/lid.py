@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
 from lerobot_env_bimanual.robot_scene import TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
@@ -77,6 +78,7 @@ class Lid(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "open": 2.5, "keep": 2.0, "shut": 2.5,
         "release": 0.8, "away": 1.2, "rest": 0.4,
     }  # fmt: skip
+    carriers: ClassVar = {"box": cube_at(10, HALF[0] + CUBE_ROOM)}
     grasp, box = "close", AREA
     holds = (HELD, LID)
     figures: ClassVar = {

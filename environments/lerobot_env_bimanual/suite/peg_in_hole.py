@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
@@ -79,6 +80,10 @@ class PegInHole(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 0.8, "bring": 2.0, "align": 1.2,
         "insert": 2.0, "keep": 1.2,
     }  # fmt: skip
+    carriers: ClassVar = {
+        "peg": cube_at(10, z=LENGTH + CUBE_ROOM),
+        "block": cube_at(20, WIDTH + CUBE_ROOM),
+    }
     grasp, box, grip, wait = "close", AREA, GRIP, WAIT
     holds = (PEG, BLOCK)
     figures: ClassVar = {

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -82,6 +83,10 @@ class Pour(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
         "bring": 2.0, "tilt": 1.6, "pour": 1.6, "back": 1.6, "leave": 1.6, "rest": 0.4,
     }  # fmt: skip
+    carriers: ClassVar = {
+        "cup": cube_at(10, CUP + CUBE_ROOM),
+        "jug": cube_at(20, JUG + CUBE_ROOM),
+    }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
     figures: ClassVar = {

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
@@ -164,6 +165,8 @@ class SuiteTask(ABC):
     grasp: ClassVar[str]
     #: Which hand may take hold of what.
     holds: ClassVar[tuple[Hold, ...]]
+    #: Which tags the objects carry, where they are in no hand's way.
+    carriers: ClassVar[Mapping[str, Carrier]]
     #: What a judge finds, and what a success needs of it.
     figures: ClassVar[Mapping[str, Figure]]
     #: Where the first object may be.

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.eyes.carriers import flat_at
 from lerobot_env_bimanual.robot_scene import BOX, PALM, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
@@ -77,6 +78,7 @@ class Wipe(SuiteTask):
         "reach": 2.0, "close": 1.5, "press": 1.2, "wipe": 6.0, "lift": 1.0, "away": 1.5,
         "rest": 0.4,
     }  # fmt: skip
+    carriers: ClassVar = {"board": flat_at(10, BOARD[0] + 0.04, upright=False)}
     grasp, box = "close", AREA
     #: Nobody carries a board that stands fast.
     holds = ()

@@ -1,0 +1,1 @@
+"""Cameras and printed tags in simulated scenes: pictures, cell files, data sets with videos."""

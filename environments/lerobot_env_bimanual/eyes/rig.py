@@ -1,0 +1,194 @@
+"""Cameras before a simulated scene whose bodies carry tags."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lerobot_env_bimanual.eyes.carriers import Carrier, add_carrier
+from lerobot_env_bimanual.eyes.lens import Imperfections, Lens, usual_camera
+from lerobot_env_bimanual.rendering import Renderer, offscreen
+from lerobot_env_bimanual.robot_scene import RobotScene
+from tpgmm_torch.exceptions import DataError, DependencyError
+from tpgmm_vision.camera import Camera
+from tpgmm_vision.cell import camera_content, pose_content
+from tpgmm_vision.poses import Array, inverse, pose_vector, rigid
+
+__all__ = ["IMAGES", "Rig", "View", "looking"]
+
+#: How LeRobot names the features of cameras.
+IMAGES = "observation.images."
+#: OpenCV's camera looks along z, y down; MuJoCo's along -z, y up.
+_TURNED = rigid(np.diag((1.0, -1.0, -1.0)), np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where a camera is.
+
+    Parameters
+    ----------
+    pose : ndarray of shape (4, 4)
+        Of the camera in the world, or in the frame of ``link``.
+    link : str, optional
+        The body that carries it.
+    """
+
+    pose: Array
+    link: str | None = None
+
+
+def looking(eye: ArrayLike, at: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """The pose (4, 4) of a camera that looks from one point at another [m]."""
+    eye = np.asarray(eye, dtype=float)
+    z = np.asarray(at, dtype=float) - eye
+    z /= np.linalg.norm(z)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return rigid(np.stack((x, np.cross(z, x), z), axis=1), eye)
+
+
+class Rig:
+    """Cameras before a scene, and tags on its bodies.
+
+    They are in a copy of the scene's model, which is brought to where the scene is before it is
+    drawn: what is simulated does not know of them.
+
+    Parameters
+    ----------
+    scene : RobotScene
+    views : mapping of str to View
+        The cameras by their names.
+    carriers : mapping of str to Carrier
+        By the body that carries the tags; ``"world"``, or a link of the robot that stands
+        still, carries tags that check.
+    objects : mapping of str to str, optional
+        Which bodies are objects, and their names in the cell; by default each carrier but
+        ``"world"``, under its own name. The others check.
+    camera : Camera, optional
+        Of all views; that of :func:`~lerobot_env_bimanual.eyes.lens.usual_camera` by default.
+    imperfections : Imperfections, optional
+        What spoils the pictures.
+
+    Raises
+    ------
+    DataError
+        If a body does not exist.
+    DependencyError
+        If nothing can be drawn on this machine.
+    """
+
+    def __init__(
+        self,
+        scene: RobotScene,
+        views: Mapping[str, View],
+        carriers: Mapping[str, Carrier],
+        objects: Mapping[str, str] | None = None,
+        camera: Camera | None = None,
+        imperfections: Imperfections | None = None,
+    ) -> None:
+        self.scene, self.views, self.carriers = scene, dict(views), dict(carriers)
+        known = {body: body for body in self.carriers if body != "world"}
+        self.objects = known if objects is None else dict(objects)
+        self.lens = Lens(camera or usual_camera())
+        self.imperfections = imperfections or Imperfections()
+        spec = scene.spec.copy()
+        there = [body.name for body in spec.bodies]
+        links = [view.link for view in self.views.values() if view.link is not None]
+        if missing := {*self.carriers, *links} - {*there}:
+            raise DataError(f"the scene has no bodies {sorted(missing)}; it has {there}")
+        for body, carrier in self.carriers.items():
+            add_carrier(spec, body, carrier)
+        for name, view in self.views.items():
+            place = pose_vector(view.pose @ _TURNED)
+            spec.body(view.link or "world").add_camera(
+                name=f"eye {name}", pos=place[:3], quat=place[3:], fovy=self.lens.fovy
+            )
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        # bodies are the same; those of their geoms that are tags come last
+        first, count = self._model.body_geomadr, scene.model.body_geomnum
+        self._geoms = np.concatenate(
+            [a + np.arange(n) for a, n in zip(first, count, strict=True)]
+        )
+        self._renderer: Renderer | None = None
+
+    def pictures(self, rng: np.random.Generator) -> dict[str, NDArray[np.uint8]]:
+        """What the cameras see now.
+
+        Parameters
+        ----------
+        rng : Generator
+            Of the noise.
+
+        Returns
+        -------
+        dict of str to ndarray of shape (height, width, 3)
+            RGB pictures by the names of the cameras.
+        """
+        self._follow()
+        if self._renderer is None:
+            if offscreen() is None:
+                raise DependencyError(
+                    "cameras cannot be drawn on this machine: install the system's EGL or "
+                    "OSMesa (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6), and leave "
+                    "MUJOCO_GL unset"
+                )
+            self._renderer = Renderer(
+                self._model, *self.lens.size, f"eye {next(iter(self.views))}"
+            )
+        drawn = {name: self._renderer(self._data, f"eye {name}") for name in self.views}
+        return {name: self.imperfections(self.lens(one), rng) for name, one in drawn.items()}
+
+    def _follow(self) -> None:
+        """Be where the scene is."""
+        seen, model, scene = self._model, self.scene.model, self.scene.data
+        self._data.qpos[:] = scene.qpos
+        seen.body_pos[:], seen.body_quat[:] = model.body_pos, model.body_quat
+        seen.geom_pos[self._geoms], seen.geom_quat[self._geoms] = (
+            model.geom_pos,
+            model.geom_quat,
+        )
+        mujoco.mj_kinematics(seen, self._data)
+        mujoco.mj_camlight(seen, self._data)
+
+    def content(self) -> dict[str, Any]:
+        """The true cell file of the scene, as :mod:`tpgmm_vision.cell` describes it."""
+        self._follow()
+        cameras = {
+            name: {
+                **camera_content(self.lens.camera, IMAGES + name),
+                "pose": pose_content(view.pose),
+                **({} if view.link is None else {"link": view.link}),
+            }
+            for name, view in self.views.items()
+        }
+        objects, checks = dict[str, Any](), dict[str, Any]()
+        for body, carrier in self.carriers.items():
+            entry = {"target": dict(carrier.entry)}
+            if body in self.objects:
+                entry["pose"] = pose_content(inverse(carrier.pose))
+                objects[self.objects[body]] = entry | (
+                    {"upright": True} if carrier.upright else {}
+                )
+            else:
+                checks["base" if body == "world" else body] = entry | {
+                    "pose": pose_content(self.pose(body) @ carrier.pose)
+                }
+        return {"cameras": cameras, "objects": objects, "checks": checks}
+
+    def pose(self, body: str) -> Array:
+        """Where a body is (4, 4)."""
+        data = self.scene.data.body(body)
+        return rigid(data.xmat.reshape(3, 3), data.xpos)
+
+    def close(self) -> None:
+        """Free what the graphics library holds."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

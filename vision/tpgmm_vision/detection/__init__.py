@@ -1,0 +1,1 @@
+"""Tags in pictures, and the poses of what carries them."""

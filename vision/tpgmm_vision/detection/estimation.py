@@ -1,0 +1,310 @@
+"""The pose of a target from the corners of its tags, with its uncertainty, or why there is none.
+
+A flat tag that is seen from the front has two poses that explain its corners nearly as well.
+All such hypotheses of all tags are fitted to all corners by Gauss-Newton; a pose is only valid
+if the next best one explains them clearly worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tpgmm_vision.camera import Camera
+from tpgmm_vision.poses import Array, angle_between, inverse, rigid, transformed
+from tpgmm_vision.targets import Target
+
+__all__ = ["PoseEstimate", "View", "estimate_pose"]
+
+#: How far what is known may be off: an upright axis [rad], the height of what stands [m].
+UPRIGHT_STD, HEIGHT_STD = np.radians(0.5), 0.001
+#: Standard deviation of corners of which no covariance is given [pixels].
+CORNER_STD = 0.1
+#: Steps of Gauss-Newton, and a step that ends it: a share of its standard deviation.
+STEPS, SMALL_STEP = 8, 0.01
+#: Hypotheses this far apart are two [rad].
+DISTINCT = np.radians(3)
+#: The second hypothesis must fit this many times worse than the first, whose misfit counts as
+#: at least one standard deviation for each number that is known.
+LEAST_RATIO = 4.0
+#: Corners further than this from where they should be contradict the pose, root mean square in
+#: standard deviations.
+MOST_MISFIT = 5.0
+#: A pose less certain than this is not valid: standard deviation [m] and [rad].
+MOST_UNCERTAIN = 0.005, np.radians(3)
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees of a target.
+
+    Parameters
+    ----------
+    camera : Camera
+    base_from_camera : ndarray of shape (4, 4)
+    corners : mapping of int to ndarray of shape (4, 2)
+        Of tags, by number [pixels].
+    covariances : mapping of int to ndarray of shape (8, 8), optional
+        Of the corners [pixels^2].
+    """
+
+    camera: Camera
+    base_from_camera: Array
+    corners: Mapping[int, Array]
+    covariances: Mapping[int, Array] | None = None
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A pose with its uncertainty.
+
+    Parameters
+    ----------
+    pose : ndarray of shape (4, 4)
+        Of the target in the base frame.
+    covariance : ndarray of shape (6, 6)
+        Of its position [m^2] and, as a rotation vector in the base frame, of its orientation
+        [rad^2].
+    residual : float
+        Of the corners, root mean square [pixels].
+    valid : bool
+    reason : str
+        Why it is not valid.
+    tags : tuple of int
+        Those that count.
+    """
+
+    pose: Array
+    covariance: Array
+    residual: float
+    valid: bool
+    reason: str
+    tags: tuple[int, ...]
+
+
+def estimate_pose(
+    views: Sequence[View],
+    target: Target,
+    *,
+    upright: bool = False,
+    height: float | None = None,
+) -> PoseEstimate | None:
+    """Estimate the pose of a target from all tags that all cameras see.
+
+    Parameters
+    ----------
+    views : sequence of View
+    target : Target
+    upright : bool, default=False
+        Whether its z axis is vertical.
+    height : float, optional
+        Of its origin in the base frame [m]. Where what is seen contradicts this or ``upright``
+        (somebody holds it), it does not count.
+
+    Returns
+    -------
+    PoseEstimate or None
+        None if no tag of the target is seen.
+    """
+    problem = _Problem.of(views, target)
+    while problem.tags:
+        free = problem.best(None)
+        known = upright, height
+        fit = free
+        if upright or height is not None:
+            bound = problem.best(known)
+            if bound.cost - free.cost < MOST_MISFIT**2:
+                fit = bound
+        misfit = fit.cost / max(problem.numbers - 6, 1)
+        if misfit <= MOST_MISFIT**2 or len(problem.tags) == 1:
+            return problem.judged(fit, misfit)
+        problem = problem.without(problem.worst(fit.pose))
+    return None
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A hypothesis that was fitted, and how well the next best fits."""
+
+    pose: Array
+    cost: float
+    information: Array
+    second: float
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """The corners of one tag in one view, and what whitens them."""
+
+    view: View
+    number: int
+    points: Array
+    seen: Array
+    whiten: Array
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """All corners of a target."""
+
+    corners: tuple[_Corners, ...]
+
+    @classmethod
+    def of(cls, views: Sequence[View], target: Target) -> _Problem:
+        """Those of the target's tags."""
+        found = []
+        for view in views:
+            for number in sorted(view.corners.keys() & target.corners.keys()):
+                covariance = (view.covariances or {}).get(number, CORNER_STD**2 * np.eye(8))
+                whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+                points, seen = target.corners[number], view.corners[number]
+                found.append(_Corners(view, number, points, seen, whiten))
+        return cls(tuple(found))
+
+    @property
+    def tags(self) -> tuple[int, ...]:
+        """Numbers of the tags."""
+        return tuple(dict.fromkeys(one.number for one in self.corners))
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers are known."""
+        return 8 * len(self.corners)
+
+    def without(self, number: int) -> _Problem:
+        """The same without a tag."""
+        return _Problem(tuple(one for one in self.corners if one.number != number))
+
+    def worst(self, pose: Array) -> int:
+        """The tag that fits a pose worst."""
+        costs = dict.fromkeys(self.tags, 0.0)
+        for one in self.corners:
+            residual, _ = _residual(one, pose)
+            costs[one.number] += float(residual @ residual)
+        return max(costs, key=lambda number: costs[number])
+
+    def best(self, known: tuple[bool, float | None] | None) -> _Fit:
+        """The hypothesis that fits best."""
+        guesses = [pose for one in self.corners for pose in _hypotheses(one)]
+        costs = [self.system(pose, known)[0] for pose in guesses]
+        order = np.argsort(costs)
+        first = self.descended(guesses[order[0]], known)
+        rivals = [
+            guesses[k] for k in order[1:] if angle_between(guesses[k], first.pose) > DISTINCT
+        ]
+        second = np.inf
+        if rivals:
+            other = self.descended(rivals[0], known)
+            if angle_between(other.pose, first.pose) > DISTINCT:
+                if other.cost < first.cost:
+                    first, other = other, first
+                second = other.cost
+        return _Fit(first.pose, first.cost, first.information, second)
+
+    def descended(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
+        """Gauss-Newton with damping."""
+        damping = 1e-3
+        cost, gradient, information = self.system(pose, known)
+        for _ in range(STEPS):
+            scale = np.diag(np.diag(information)) * damping + 1e-6 * np.eye(6)
+            step = -np.linalg.solve(information + scale, gradient)
+            step *= min(1, 0.5 / float(np.abs(step).max()))
+            turn = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
+            new = rigid(turn, pose[:3, 3] + step[:3])
+            found = self.system(new, known)
+            if found[0] <= cost:
+                pose, damping = new, damping / 10
+                cost, gradient, information = found
+                if float(step @ information @ step) < SMALL_STEP**2:
+                    break
+            else:
+                damping = max(10 * damping, 1e-2)
+        return _Fit(pose, cost, information, np.inf)
+
+    def system(
+        self, pose: Array, known: tuple[bool, float | None] | None
+    ) -> tuple[float, Array, Array]:
+        """Sum of squares in standard deviations, its gradient / 2 and Gauss-Newton's matrix."""
+        parts = [_residual(one, pose) for one in self.corners]
+        residual = np.concatenate([part[0] for part in parts])
+        rates = np.concatenate([part[1] for part in parts])
+        if known is not None:
+            upright, height = known
+            if upright:
+                axis, turn = pose[:3, 2], np.zeros((2, 6))
+                # of the axis' x and y with a small rotation: w x axis
+                turn[0, 3:], turn[1, 3:] = (0, axis[2], -axis[1]), (-axis[2], 0, axis[0])
+                # further than a quarter turn away it is no nearer
+                away = axis[:2] if axis[2] > 0 else axis[:2] / max(np.linalg.norm(axis[:2]), 1e-3)
+                residual = np.append(residual, away / UPRIGHT_STD)
+                rates = np.concatenate((rates, turn / UPRIGHT_STD))
+            if height is not None:
+                residual = np.append(residual, (pose[2, 3] - height) / HEIGHT_STD)
+                rates = np.concatenate((rates, np.eye(1, 6, 2) / HEIGHT_STD))
+        return float(residual @ residual), rates.T @ residual, rates.T @ rates
+
+    def judged(self, fit: _Fit, misfit: float) -> PoseEstimate:
+        """The pose, whether it can be trusted, and if not why."""
+        covariance = np.linalg.pinv(fit.information, hermitian=True) * max(misfit, 1)
+        position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
+                          (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
+        reason = ""
+        if misfit > MOST_MISFIT**2:
+            reason = "the corners of its tag fit no pose"
+        elif fit.second < LEAST_RATIO * max(fit.cost, self.numbers - 6):
+            reason = "two poses explain what is seen"
+        elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
+            reason = (
+                f"it is uncertain by {1e3 * position:.0f} mm and {np.degrees(turn):.0f} deg: "
+                "its tags are too small in the picture"
+            )
+        squares = [_pixels(one, fit.pose) - one.seen for one in self.corners]
+        residual = float(np.sqrt(np.mean(np.square(squares).sum(-1))))
+        return PoseEstimate(fit.pose, covariance, residual, not reason, reason, self.tags)
+
+
+def _hypotheses(one: _Corners) -> list[Array]:
+    """Both poses of the target by which a flat tag can be explained."""
+    points = one.points
+    size = float(np.linalg.norm(points[1] - points[0]))
+    x, y = (points[1] - points[0]) / size, (points[0] - points[3]) / size
+    target_from_tag = rigid(np.stack((x, y, np.cross(x, y)), axis=1), points.mean(0))
+    square = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * size / 2
+    camera = one.view.camera
+    _, turns, places, _ = cv2.solvePnPGeneric(
+        square, one.seen.reshape(4, 1, 2), camera.matrix, np.array(camera.distortion),
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )  # fmt: skip
+    tag_from_target = inverse(target_from_tag)
+    found = []
+    for turn, place in zip(turns, places, strict=True):
+        if np.isfinite(turn).all() and np.isfinite(place).all():
+            found.append(one.view.base_from_camera @ rigid(turn, place) @ tag_from_target)
+    return found
+
+
+def _pixels(one: _Corners, pose: Array) -> Array:
+    """Where the corners of a tag are expected."""
+    camera_from_target = inverse(one.view.base_from_camera) @ pose
+    return one.view.camera.project(transformed(camera_from_target, one.points))
+
+
+def _residual(one: _Corners, pose: Array) -> tuple[Array, Array]:
+    """Expected less seen corners (8,) in standard deviations, and how the pose moves them."""
+    camera_from_base = inverse(one.view.base_from_camera)
+    turned = one.points @ pose[:3, :3].T
+    points = transformed(camera_from_base, turned + pose[:3, 3])
+    if (points[:, 2] < 1e-3).any():  # behind the camera
+        return np.full(8, 1e3), np.zeros((8, 6))
+    pixels, rates = one.view.camera.projected(points)
+    rates = rates @ camera_from_base[:3, :3]
+    x, y, z = turned.T
+    zero = np.zeros(4)
+    # d (w x p) / d w = -[p]x
+    cross = np.stack((zero, z, -y, -z, zero, x, y, -x, zero), axis=-1).reshape(4, 3, 3)
+    moved = np.concatenate((rates, rates @ cross), axis=-1).reshape(8, 6)
+    return one.whiten @ (pixels - one.seen).ravel(), one.whiten @ moved
