@@ -16,7 +16,8 @@ from tpgmm_torch.exceptions import DataError
 
 __all__ = [
     "BOX", "CAMERA", "CYLINDER", "DAMPING", "PALM", "PALM_SIZE", "STIFFNESS", "TABLE",
-    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_weld", "controlled", "robot_spec",
+    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_view", "add_weld", "controlled",
+    "robot_spec",
 ]  # fmt: skip
 
 #: Of the simulation and of the position control of the joints [s].
@@ -73,12 +74,12 @@ def controlled(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpec:
     for hand in HANDS:
         palm = spec.body(hand).geoms[0]
         palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", PALM, (0.85, 0.45, 0.2, 1)
-    _add_view(spec)
+    add_view(spec)
     return spec
 
 
-def _add_view(spec: Any) -> None:
-    """A camera before the robot, light and a bright sky: cheap to draw by a processor."""
+def add_view(spec: Any) -> None:
+    """Add a camera before the robot, light and a bright sky: cheap to draw by a processor."""
     spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
     world, texture = spec.worldbody, mujoco.mjtTexture
     world.add_camera(

@@ -58,7 +58,7 @@ def so101_spec() -> mujoco.MjSpec:
         touch what has the bit ``PALM``.
     """
     spec = mujoco.MjSpec.from_string(bi_so101_urdf())
-    spec.compiler.fusestatic = False
+    spec.compiler.fusestatic = spec.compiler.discardvisual = False
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for joint in list(spec.joints):

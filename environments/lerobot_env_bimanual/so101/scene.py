@@ -10,36 +10,53 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.robot_scene import (
     BOX,
-    CAMERA,
     CYLINDER,
     PALM,
     TABLE,
     add_geom,
     add_table,
+    add_view,
 )
+from lerobot_env_bimanual.so101 import TASKS
 from lerobot_env_bimanual.so101.robot import PLAY, hand_of, so101_spec
 from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 
 __all__ = [
-    "CUP", "GRIP", "LEFT", "OBJECTS", "RIGHT", "SAUCER_TOP", "STEM", "BiSo101Scene",
-    "in_left_hand",
+    "CARRIERS", "CUP", "GRIP", "LEFT", "LEFT_UP", "OBJECTS", "RIGHT", "RIGHT_UP", "SAUCER_TOP",
+    "STEM", "BiSo101Scene", "in_left_hand",
 ]  # fmt: skip
 
-OBJECTS = ("cup", "saucer")
+OBJECTS = TASKS["cup_on_saucer"]
 LEFT = Hold(hand_of("left"), "saucer", "saucer")
 RIGHT = Hold(hand_of("right"), "cup", "stem")
 #: Radius of the cup and half its height, radius of its stem, and the middle of the stem above
 #: the cup's foot [m].
-CUP, CUP_HALF, STEM_RADIUS, STEM = 0.025, 0.025, 0.008, 0.065
-#: Edge of the cube on the stem, whose middle is so high above the cup's foot [m].
-CUBE, CUBE_MIDDLE = 0.0375, 0.099
+CUP, CUP_HALF, STEM_RADIUS, STEM = 0.025, 0.025, 0.008, 0.060
+#: Edge of the tags on cubes, half an edge of a cube of them, and of the block inside [m].
+TAG = 0.03
+CUBE = TAG * 10 / 16
+BLOCK = CUBE - 0.001
+#: The middle of the cup's cube above its foot [m].
+CUBE_MIDDLE = 0.118
 #: Radius of the saucer and its top above its middle [m].
 SAUCER, SAUCER_TOP = 0.055, 0.003
+#: The middle of its cube, at the end of its x axis [m].
+SAUCER_CUBE = (SAUCER + CUBE, 0.0, CUBE - SAUCER_TOP)
+CARRIERS = {
+    "cup": cube_at(10, z=CUBE_MIDDLE, size=TAG),
+    "saucer": cube_at(20, *SAUCER_CUBE, size=TAG),
+}
 #: Where the stem is in the right gripper, seen from the link between its jaws: beside the fixed
-#: jaw, and not at the very ends; where the middle of the saucer is in the left one [m].
-GRIP, HELD = (-0.006, 0.0, -0.012), (0.0, 0.0, 0.045)
+#: jaw, and not at the very ends; how far ahead of the left one the middle of the saucer is [m].
+GRIP, HELD_AHEAD = (-0.006, 0.0, -0.012), 0.045
+#: How the hands then point: down by so much [rad]. Which axis of each is vertical then, pointing
+#: up, follows.
+RIGHT_TILT, LEFT_TILT = math.radians(40.0), math.radians(30.0)
+RIGHT_UP = (0.0, -math.cos(RIGHT_TILT), -math.sin(RIGHT_TILT))
+LEFT_UP = (-math.cos(LEFT_TILT), 0.0, -math.sin(LEFT_TILT))
 #: By how much the saucer's x axis, at whose end its cube stands, is turned from the left hand's
 #: forward [rad]: the cube then faces a camera before the robot.
 CUBE_TURN = math.radians(40.0)
@@ -58,11 +75,12 @@ class BiSo101Scene(SuiteScene):
 
     def __init__(self) -> None:
         spec = so101_spec()
-        spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
-        _add_view(spec)
+        add_view(spec)
         add_table(spec, 0.8)
         _add_cup(spec)
         _add_saucer(spec)
+        # the fixed jaw lies askew under the saucer that it holds
+        spec.add_exclude(bodyname1=LEFT.hand, bodyname2="saucer")
         super().__init__(spec, OBJECTS, (LEFT, RIGHT))
         joints = [self.model.joint(i) for i in self.model.actuator_trnid[:, 0]]
         plays = [self.model.joint(joint.name + PLAY).qposadr[0] for joint in joints]
@@ -121,18 +139,6 @@ class BiSo101Scene(SuiteScene):
                 self.hold(hold)
 
 
-def _add_view(spec: Any) -> None:
-    """A camera before the robot, and light."""
-    eye, middle = np.array((0.80, -0.03, 0.52)), np.array((0.24, -0.03, 0.08))
-    back = (eye - middle) / np.linalg.norm(eye - middle)
-    right = np.cross((0.0, 0.0, 1.0), back)
-    right /= np.linalg.norm(right)
-    spec.worldbody.add_camera(
-        name=CAMERA, pos=eye, xyaxes=(*right, *np.cross(back, right)), fovy=45
-    )
-    spec.worldbody.add_light(pos=(0.6, 0.3, 1.4), dir=(-0.3, -0.2, -1), diffuse=(0.8,) * 3)
-
-
 def _add_cup(spec: Any) -> None:
     """A cup that stands on four feet, with a stem and a cube on it."""
     cup, white = add_thing(spec, "cup"), {"rgba": (0.9, 0.9, 0.95, 1)}
@@ -142,10 +148,10 @@ def _add_cup(spec: Any) -> None:
     for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         place = (aside * x, aside * y, radius)
         add_geom(cup, mujoco.mjtGeom.mjGEOM_SPHERE, (radius, 0, 0), pos=place, **foot)
-    half = CUBE_MIDDLE / 2 - CUP_HALF
+    half = (CUBE_MIDDLE - 2 * CUP_HALF) / 2
     stem = {"name": "stem", "pos": (0, 0, 2 * CUP_HALF + half), "conaffinity": PALM}
     add_geom(cup, CYLINDER, (STEM_RADIUS, half, 0), mass=0.01, **stem, **white)
-    add_geom(cup, BOX, (CUBE / 2,) * 3, pos=(0, 0, CUBE_MIDDLE), mass=0.02, **white)
+    add_geom(cup, BOX, (BLOCK,) * 3, pos=(0, 0, CUBE_MIDDLE), mass=0.02, **white)
 
 
 def _add_saucer(spec: Any) -> None:
@@ -153,27 +159,25 @@ def _add_saucer(spec: Any) -> None:
     saucer, look = add_thing(spec, "saucer"), {"rgba": (0.35, 0.5, 0.75, 1)}
     size = (SAUCER, SAUCER_TOP, 0)
     add_geom(saucer, CYLINDER, size, name="saucer", mass=0.05, conaffinity=PALM, **look)
-    top = (0.8 * SAUCER, 0.8 * SAUCER, SAUCER_TOP)
+    top = (0.7 * SAUCER, 0.7 * SAUCER, SAUCER_TOP)
     add_geom(saucer, BOX, top, mass=0, contype=OBJECT, conaffinity=OBJECT, **look)
-    place = (SAUCER + CUBE / 2, 0, CUBE / 2 - SAUCER_TOP)
-    add_geom(saucer, BOX, (CUBE / 2,) * 3, pos=place, mass=0.02, **look)
+    add_geom(saucer, BOX, (BLOCK,) * 3, pos=SAUCER_CUBE, mass=0.02, **look)
 
 
 def in_left_hand(aside: float = 0.0, turn: float = 0.0) -> NDArray[np.float64]:
-    """The saucer in the left gripper, shape (7,): level where that is.
+    """The saucer in the left gripper, shape (7,): level where that points down as it should.
 
     Parameters
     ----------
     aside : float
-        How far it was pushed in too far [m].
+        By how much it is farther between the jaws [m].
     turn : float
-        How far it is turned about its own axis [rad].
+        By how much it is turned about its own axis [rad].
     """
-    axes = np.zeros((3, 3))
-    axes[:, 2] = (-1.0, 0.0, 0.0)  # up, where the hand is level: its x axis points down
+    up = np.array(LEFT_UP)
+    ahead = np.cross((0.0, 1.0, 0.0), up)  # y points to the left
     angle = CUBE_TURN + turn
-    axes[:, 0] = (0.0, math.sin(angle), math.cos(angle))
-    axes[:, 1] = np.cross(axes[:, 2], axes[:, 0])
+    x = math.cos(angle) * ahead + math.sin(angle) * np.array((0.0, 1.0, 0.0))
     quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, axes.ravel())
-    return np.concatenate((np.array(HELD) - (0.0, 0.0, aside), quaternion))
+    mujoco.mju_mat2Quat(quaternion, np.stack((x, np.cross(up, x), up), axis=1).ravel())
+    return np.concatenate(((HELD_AHEAD - aside) * ahead, quaternion))

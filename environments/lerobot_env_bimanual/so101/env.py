@@ -1,0 +1,212 @@
+"""Cup on saucer: two SO-101 arms as a gymnasium environment, in LeRobot's units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.bottle.measures import Figure, successful
+from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.disturbances import Course, displaced
+from lerobot_env_bimanual.eyes.carriers import cube_at
+from lerobot_env_bimanual.eyes.lens import Imperfections, usual_camera
+from lerobot_env_bimanual.eyes.rig import Rig
+from lerobot_env_bimanual.eyes.views import around, chosen_views
+from lerobot_env_bimanual.so101 import TASKS
+from lerobot_env_bimanual.so101.kinematics import Reach
+from lerobot_env_bimanual.so101.robot import SIDES
+from lerobot_env_bimanual.so101.scene import (
+    CARRIERS,
+    GRIP,
+    LEFT_UP,
+    RIGHT,
+    RIGHT_UP,
+    SAUCER_TOP,
+    BiSo101Scene,
+    in_left_hand,
+)
+from lerobot_env_bimanual.start import Start
+from lerobot_env_bimanual.suite.task import Box
+from tpgmm_datasets.robots import bi_so101_urdf, parse_robot
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = ["FIGURES", "OFFSET", "OPEN", "BiSo101Env"]
+
+#: What a success needs.
+FIGURES = {
+    "place_mm": Figure("from the saucer's middle [mm]", 1, high=15.0),
+    "lean_deg": Figure("lean [deg]", 1, high=10.0),
+    "standing": Figure("stands on it", 0, 1.0, 1.0),
+    "away_mm": Figure("right hand from the stem [mm]", low=20.0),
+}
+#: Standard deviation of the joints' offsets [rad].
+OFFSET = math.radians(1.0)
+#: Where the cup stands, and where the saucer is held at first [m, deg].
+CUP_BOX = Box((0.26, -0.15, 0.0), (0.31, -0.08, 0.0), 30.0)
+SAUCER_BOX = Box((0.24, 0.09, 0.12), (0.29, 0.14, 0.15), 0.0)
+#: Where the right hand waits: the place of the grip [m].
+RIGHT_BOX = Box((0.19, -0.22, 0.14), (0.23, -0.16, 0.18), 0.0)
+#: How the saucer lies in the left hand differs by so much [m, rad].
+HELD_ASIDE, HELD_TURN = 0.004, math.radians(5.0)
+#: Postures from which inverse kinematics begins [rad]: the elbow is up.
+SEEDS = {"left": (0.3, 0.0, 0.6, 0.0, 0.0), "right": (-0.3, 0.0, 0.6, 0.3, 1.57)}
+#: An open gripper, of 100.
+OPEN = 40.0
+#: How long an episode takes [s], and when what happens in it.
+DURATION, COURSE = 18.0, Course(grasp=4.0, latest=9.0, end=11.5)
+#: Cameras at the distance at which a person sets them up before such arms, and a cube of tags
+#: beside the left arm, by which one that was moved is noticed.
+CENTRE = (0.22, 0.0, 0.1)
+VIEWS = {"front": around(CENTRE, 0.75, 0.0, 40.0), "side": around(CENTRE, 0.75, -50.0, 40.0)}
+CHECK = {"world": cube_at(0, 0.05, 0.0, 0.05)}
+
+
+class BiSo101Env(ControlledEnv):
+    """Two SO-101 arms that put a cup on a saucer.
+
+    The left gripper holds a saucer from the beginning, and brings it before the robot; the
+    right one takes the cup by its stem and puts it on the saucer. Joints are observed and
+    commanded as LeRobot's ``bi_so_follower`` does: arms in degrees, grippers from 0 to 100.
+
+    The servos are those of a hobby robot. Gravity bends them: up to 2 degrees in each joint of
+    a stretched arm. Behind each motor there are 0.4 degrees of play, which its encoder does
+    not measure. What it measures is off by an offset of 1 degree (standard deviation), which
+    belongs to the pair of arms and not to the episode.
+
+    At the end of an episode ``info`` holds ``place_mm``, how far the cup is from the middle of
+    the saucer; ``lean_deg``, its angle with the vertical; ``standing``, whether it is free and
+    touches the saucer; ``away_mm``, how far the open right gripper has left the stem; and
+    ``is_success``: at most 15 mm and 10 degrees, standing, at least 20 mm away.
+
+    Parameters
+    ----------
+    task : str, default="cup_on_saucer"
+    specimen : int, default=0
+        Which pair of arms: the seed of the joints' offsets.
+    **options
+        Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``mode`` and
+        ``track``. Cameras are ``"front"`` and ``"side"``, at 0.75 m.
+
+    Attributes
+    ----------
+    offsets : ndarray of shape (12,)
+        Added to measured joints they are those of the robot's description [rad].
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If an option is not one of the above.
+    """
+
+    carriers: ClassVar = CARRIERS
+    _scene: BiSo101Scene
+
+    def __init__(
+        self, task: str = "cup_on_saucer", *, specimen: int = 0, fps: int = 25, **options: Any
+    ) -> None:
+        if task not in TASKS:
+            raise UnknownNameError("task", task, "the SO-101 arms", TASKS)
+        self.model = parse_robot(bi_so101_urdf())
+        names = self.model.joint_names
+        grippers = np.array([name.endswith("gripper") for name in names])
+        drawn = np.random.default_rng(specimen).standard_normal(len(names))
+        self.offsets = np.where(grippers, 0.0, OFFSET * drawn)
+        low, high = self.model.lower.numpy(), self.model.upper.numpy()
+        # radians = factor * stored + zero
+        self._factor = np.where(grippers, (high - low) / 100, math.pi / 180)
+        self._zero = np.where(grippers, low, self.offsets)
+        super().__init__(
+            self.model, BiSo101Scene(), DURATION, COURSE, fps=fps, track=True, **options
+        )
+        self.task, self.task_description = task, "put the cup on the saucer"
+        self._reach = {side: Reach(self._scene, side) for side in SIDES}
+        bounds = self.stored(low), self.stored(high)
+        self.action_space = spaces.Box(*(b.astype(np.float32) for b in bounds), dtype=np.float32)
+        self.observation_space["agent_pos"] = spaces.Box(
+            bounds[0] - 30.0, bounds[1] + 30.0, dtype=np.float64
+        )
+
+    @property
+    def scene(self) -> BiSo101Scene:
+        """The simulated world, which an expert sees."""
+        return self._scene
+
+    def stored(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+        """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
+        return np.asarray((joints - self._zero) / self._factor)
+
+    def rig(
+        self,
+        cameras: str | Sequence[str],
+        size: tuple[int, int] = (640, 480),
+        imperfections: Imperfections | None = None,
+    ) -> Rig:
+        """Cameras before the arms, and tags on the objects and between the bases."""
+        views = {name: VIEWS[name] for name in chosen_views(cameras)}
+        carriers = {**CHECK, **self.carriers}
+        camera = usual_camera(*size)
+        return Rig(self._scene, views, carriers, camera=camera, imperfections=imperfections)
+
+    def cell(self) -> dict[str, Any]:
+        """The true cell file of the environment with its cameras, with the offsets."""
+        pairs = zip(self.joint_names, self.offsets.tolist(), strict=True)
+        return {**super().cell(), "joint_offsets": {name: off for name, off in pairs if off}}
+
+    def figures(self) -> dict[str, float]:
+        """How well the episode goes, so far."""
+        scene = self._scene
+        saucer, cup = scene.data.body("saucer"), scene.data.body("cup")
+        away = saucer.xmat.reshape(3, 3).T @ (cup.xpos - saucer.xpos)
+        lean = math.degrees(math.acos(min(1.0, max(-1.0, float(cup.xmat[8])))))
+        touches = bool(np.abs(scene.force("saucer", "cup")).max() > 0)
+        return {
+            "place_mm": 1e3 * math.hypot(away[0], away[1]),
+            "lean_deg": lean,
+            "standing": float(touches and RIGHT not in scene.held),
+            "away_mm": 1e3 * max(scene.gap(RIGHT), 0.0),
+        }
+
+    def _successful(self, figures: Mapping[str, float]) -> bool:
+        return successful(figures, FIGURES)
+
+    def _begin(self, options: Mapping[str, Any]) -> Start:
+        rng, names = self.np_random, self.model.joint_names
+        cup, saucer, grip = (box.draw(rng) for box in (CUP_BOX, SAUCER_BOX, RIGHT_BOX))
+        held = in_left_hand(*rng.uniform(-1, 1, 2) * (HELD_ASIDE, HELD_TURN))
+        left = self._reach["left"](SEEDS["left"], saucer[:3], held[:3], LEFT_UP)
+        right = self._reach["right"](SEEDS["right"], grip[:3], GRIP, RIGHT_UP)
+        low, high = self._lower, self._upper
+        joints = np.concatenate((left, low[5:6], right, low[11:] + OPEN / 100 * (high - low)[11:]))
+        drawn = Start.drawn(rng, self.model, 2)
+        start = Start(joints=joints, poses={"cup": cup}, **drawn).given(options, self.model)
+        self._scene.reset({**start.poses, "saucer": held}, start.joints)
+        return start
+
+    def _hold_still(self) -> None:
+        """Be at rest, with references that hold the arms up where they are."""
+        super()._hold_still()
+        self._reference = np.array(self._scene.data.ctrl)
+        self._queue = np.tile(self._reference, (self._start.delay + 1, 1))
+
+    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
+        return super()._checked(action) * self._factor + self._zero
+
+    def _observation(self) -> Observation:
+        observation = super()._observation()
+        return {**observation, "agent_pos": self.stored(observation["agent_pos"])}
+
+    def _act(self, stopped: bool) -> None:
+        self._scene.grip()
+
+    def _usual(self, step: NDArray[np.float64]) -> bool:
+        return CUP_BOX.contains(displaced(self._start.poses["cup"], step))
+
+    def _displace(self, step: NDArray[np.float64]) -> None:
+        if RIGHT not in self._scene.taken:
+            self._scene.put("cup", displaced(self._start.poses["cup"], step))
