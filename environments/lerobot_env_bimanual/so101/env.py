@@ -62,9 +62,9 @@ OPEN = 40.0
 DURATION, COURSE = 18.0, Course(grasp=4.0, latest=9.0, end=11.5)
 #: Cameras at the distance at which a person sets them up before such arms, and a cube of tags
 #: beside the left arm, by which one that was moved is noticed.
-CENTRE = (0.22, 0.0, 0.1)
-VIEWS = {"front": around(CENTRE, 0.75, 0.0, 40.0), "side": around(CENTRE, 0.75, -50.0, 40.0)}
-CHECK = {"world": cube_at(0, 0.05, 0.0, 0.05)}
+CENTRE = (0.20, 0.0, 0.11)
+VIEWS = {"front": around(CENTRE, 0.7, 0.0, 40.0), "side": around(CENTRE, 0.7, -50.0, 40.0)}
+CHECK = {"world": cube_at(0, 0.08, 0.35, 0.05)}
 
 
 class BiSo101Env(ControlledEnv):
@@ -91,7 +91,7 @@ class BiSo101Env(ControlledEnv):
         Which pair of arms: the seed of the joints' offsets.
     **options
         Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``mode`` and
-        ``track``. Cameras are ``"front"`` and ``"side"``, at 0.75 m.
+        ``track``. Cameras are ``"front"`` and ``"side"``, at 0.7 m.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class BiSo101Env(ControlledEnv):
         size: tuple[int, int] = (640, 480),
         imperfections: Imperfections | None = None,
     ) -> Rig:
-        """Cameras before the arms, and tags on the objects and between the bases."""
+        """Cameras before the arms, and tags on the objects and beside the left arm."""
         views = {name: VIEWS[name] for name in chosen_views(cameras)}
         carriers = {**CHECK, **self.carriers}
         camera = usual_camera(*size)

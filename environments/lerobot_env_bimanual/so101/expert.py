@@ -28,17 +28,19 @@ __all__ = ["MEETING", "PHASES", "teleoperated"]
 Array = NDArray[np.float64]
 #: Nominal seconds of the phases, which differ by up to a share.
 PHASES = {
-    "reach": 2.2, "approach": 1.2, "close": 0.8, "lift": 1.0, "bring": 2.2, "hover": 0.4,
-    "lower": 1.6, "open": 1.0, "leave": 1.2, "rest": 0.8,
+    "reach": 2.2, "approach": 1.2, "close": 1.4, "lift": 1.0, "bring": 2.2, "hover": 0.4,
+    "lower": 1.6, "open": 1.4, "leave": 1.2, "rest": 0.8,
 }  # fmt: skip
 STRETCH = 0.2
 #: While the right hand does these, the left one brings the saucer.
 BRINGING = ("approach", "close", "lift")
 #: Where it brings it, and by how much that differs [m].
-MEETING, MEETING_SPREAD = (0.255, 0.0, 0.085), (0.02, 0.02, 0.015)
+MEETING, MEETING_SPREAD = (0.245, 0.0, 0.085), (0.015, 0.02, 0.015)
 #: How far behind the stem the right hand waits, how high the cup is lifted, and how high above
 #: the saucer it is brought [m].
 BEHIND, LIFT, ABOVE = 0.06, 0.09, 0.05
+#: How far from the stem the fixed jaw is brought, before it is moved beside it [m].
+CLEAR = 0.01
 #: Standard deviation of how far ways through free space bend aside [m].
 BOW = 0.01
 #: How much of what a joint is off its place is corrected in a second, and at most [rad].
@@ -77,26 +79,31 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
         if phase in ("lift", "bring", "hover", "lower"):
             point = right.point(scene.pose("cup"))
         begin = right.place(point[0])
+        aside = CLEAR * np.cross(heading, (0.0, 0.0, 1.0))
         for tick in range(1, ticks + 1):
             share = tick / ticks
             saucer = scene.pose("saucer")[:3]
             goal = {
-                "reach": stem - BEHIND * heading,
-                "approach": stem,
+                "reach": stem - BEHIND * heading + aside,
+                "approach": stem + aside,
+                "close": stem,
                 "lift": begin + (0.0, 0.0, LIFT),
                 "bring": saucer + (0.0, 0.0, ABOVE),
                 "hover": saucer + (0.0, 0.0, ABOVE),
                 "lower": saucer + (0.0, 0.0, SAUCER_TOP),
+                "open": begin + aside,
                 "leave": begin - BEHIND * heading,
             }.get(phase)
+            # beside the stem before the jaws close, away from it when they have opened
+            first, second = min(1.0, 2 * share), max(0.0, 2 * share - 1)
             if goal is not None:
-                way = begin + _jerk(share) * (goal - begin)
+                done = {"close": first, "open": second}.get(phase, share)
+                way = begin + _jerk(done) * (goal - begin)
                 if phase in ("reach", "bring"):
                     way += bow[int(phase == "bring")] * math.sin(math.pi * _jerk(share)) ** 2
                 right.move(way, *point)
             if phase in ("close", "open"):
-                closed = _jerk(min(1.0, 1.5 * share))
-                gripper = OPEN * (1 - closed if phase == "close" else closed)
+                gripper = OPEN * (_jerk(first) if phase == "open" else 1 - _jerk(second))
             if phase in BRINGING:
                 spent += 1 / env.fps
                 left.move(brought + _jerk(min(1.0, spent / total)) * (meeting - brought), *carried)

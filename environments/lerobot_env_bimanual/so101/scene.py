@@ -43,6 +43,8 @@ BLOCK = CUBE - 0.001
 CUBE_MIDDLE = 0.118
 #: Radius of the saucer and its top above its middle [m].
 SAUCER, SAUCER_TOP = 0.055, 0.003
+#: Half the thickness of what the cup collides with [m].
+DEPTH = 0.015
 #: The middle of its cube, at the end of its x axis [m].
 SAUCER_CUBE = (SAUCER + CUBE, 0.0, CUBE - SAUCER_TOP)
 CARRIERS = {
@@ -159,8 +161,10 @@ def _add_saucer(spec: Any) -> None:
     saucer, look = add_thing(spec, "saucer"), {"rgba": (0.35, 0.5, 0.75, 1)}
     size = (SAUCER, SAUCER_TOP, 0)
     add_geom(saucer, CYLINDER, size, name="saucer", mass=0.05, conaffinity=PALM, **look)
-    top = (0.7 * SAUCER, 0.7 * SAUCER, SAUCER_TOP)
-    add_geom(saucer, BOX, top, mass=0, contype=OBJECT, conaffinity=OBJECT, **look)
+    # what stands on it is pushed up, however deep a hand has pressed it in
+    top, below = (0.7 * SAUCER, 0.7 * SAUCER, DEPTH), (0.0, 0.0, SAUCER_TOP - DEPTH)
+    stop = {"contype": OBJECT, "conaffinity": OBJECT, "group": 3}
+    add_geom(saucer, BOX, top, pos=below, mass=0, **stop)
     add_geom(saucer, BOX, (BLOCK,) * 3, pos=SAUCER_CUBE, mass=0.02, **look)
 
 
