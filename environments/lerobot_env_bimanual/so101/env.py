@@ -59,7 +59,7 @@ SEEDS = {"left": (0.3, 0.0, 0.6, 0.0, 0.0), "right": (-0.3, 0.0, 0.6, 0.3, 1.57)
 #: An open gripper, of 100.
 OPEN = 40.0
 #: How long an episode takes [s], and when what happens in it.
-DURATION, COURSE = 18.0, Course(grasp=4.0, latest=9.0, end=11.5)
+DURATION, COURSE = 17.0, Course(grasp=4.0, latest=9.0, end=11.5)
 #: Cameras at the distance at which a person sets them up before such arms, and a cube of tags
 #: beside the left arm, by which one that was moved is noticed.
 CENTRE = (0.20, 0.0, 0.11)
