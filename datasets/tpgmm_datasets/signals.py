@@ -14,10 +14,12 @@ from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
-from tpgmm_datasets.units import Scale, as_scale
+from tpgmm_datasets.units import Scale, shifted
 
-__all__ = ["Signals"]
+__all__ = ["CELL", "Signals"]
 
+#: The cell of a set whose objects were tracked.
+CELL = "meta/cell.json"
 REMEDY = "A policy observes each joint, and gives an action for it"
 
 
@@ -39,6 +41,8 @@ class Signals:
     frames : mapping of str to tuple of int
         Where frames are in ``observation.environment_state``, as position and quaternion
         (w, x, y, z) in metres.
+    cell : Path, optional
+        The file of the cell in whose pictures the objects were tracked.
     """
 
     fps: float
@@ -47,6 +51,7 @@ class Signals:
     environment_names: tuple[str, ...] | None
     units: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     frames: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    cell: Path | None = None
 
     @classmethod
     def of(
@@ -82,8 +87,8 @@ class Signals:
         action = action and _renamed(action, source, called, given)
         environment = layout.features.get(ENVIRONMENT)
         scales = {
-            name: as_scale(unit, source.key)
-            for name, unit in zip(columns.names or (), columns.units, strict=False)
+            name: scale
+            for name, scale in zip(columns.names or (), columns.scales, strict=False)
             if robot is None or name in robot.joint_names
         }
         for feature in (state, action):
@@ -92,7 +97,9 @@ class Signals:
         places = {
             name: tuple(pose.select(name, environment))
             for name, pose in frame_sources(layout, frames, recording.episodes).items()
-            if isinstance(pose, FramePose) and environment and _plain(pose)
+            if isinstance(pose, FramePose)
+            and environment
+            and (pose.feature, pose.rotation, pose.scale) == (ENVIRONMENT, "wxyz", 1)
         }
         return cls(
             assembly.rate or layout.fps,
@@ -101,6 +108,7 @@ class Signals:
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
             places,
+            cell if (cell := layout.root / CELL).exists() else None,
         )
 
 
@@ -117,16 +125,13 @@ def _renamed(
     return replace(feature, names=names and tuple(called.get(name, name) for name in names))
 
 
-def _plain(pose: FramePose) -> bool:
-    return pose.feature == ENVIRONMENT and pose.rotation == "wxyz" and pose.scale == 1
-
-
 def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
     """What else holds the joints declares the same units, if any."""
     names, units = feature.names or (), feature.units or ()
     matched = match_names(list(scales), names, feature.key, REMEDY)
-    for entry, unit in zip(names, units, strict=True):
+    own = shifted(units, feature.offsets, feature.key)
+    for entry, unit, scale in zip(names, units, own, strict=True):
         joint = matched.get(entry)
-        if joint and unit != "raw" and as_scale(unit, feature.key) != scales[joint]:
+        if joint and unit != "raw" and scale != scales[joint]:
             message = f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit"
             raise DatasetError(f"{message}: a policy needs one of both", column=feature.key)

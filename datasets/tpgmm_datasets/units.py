@@ -25,6 +25,7 @@ __all__ = [
     "convert",
     "fits",
     "guess_unit",
+    "shifted",
     "units_of",
     "with_pose_units",
 ]
@@ -233,6 +234,19 @@ def as_scale(unit: Unit, column: str) -> Scale:
         there = f"{sorted(NAMED)}, 'lerobot', 'auto' and Scale"
         raise DatasetError(f"unit {unit!r} is unknown; there are {there}", column=column)
     return NAMED[unit]
+
+
+def shifted(units: Sequence[Unit], offsets: Sequence[float] | None, column: str) -> list[Scale]:
+    """The scales that units stand for, with an offset [rad or m] behind each.
+
+    Examples
+    --------
+    >>> shifted(["rad"], [0.1], "action")
+    [Scale(factor=1.0, offset=0.1)]
+    """
+    scales = [as_scale(unit, column) for unit in units]
+    pairs = zip(scales, offsets or [0.0] * len(scales), strict=True)
+    return [replace(scale, offset=scale.offset + offset) for scale, offset in pairs]
 
 
 def fits(pattern: str, *names: str) -> bool:

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import groupby
 from pathlib import Path
@@ -43,7 +43,7 @@ from tpgmm_datasets.lerobot.statistics import (
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
-__all__ = ["add_frames", "save_lerobot"]
+__all__ = ["Column", "add_frames", "open_to_copy", "save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -149,7 +149,37 @@ def save_lerobot(
     return path
 
 
-def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSource]) -> Path:
+@dataclass(frozen=True)
+class Column:
+    """A column for a copy of a data set.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of its values.
+    values : dict of int to ndarray of shape (T, width)
+        By the episode's index; one type for all.
+    """
+
+    names: Sequence[str]
+    values: dict[int, np.ndarray[Any, Any]]
+
+    @property
+    def declared(self) -> dict[str, Any]:
+        """What ``info.json`` says of it."""
+        dtype = str(next(iter(self.values.values())).dtype)
+        return {"dtype": dtype, "shape": [len(self.names)], "names": list(self.names)}
+
+
+def add_frames(
+    path: str | Path,
+    out: str | Path,
+    frames: Mapping[str, FrameSource],
+    *,
+    columns: Mapping[str, Column] | None = None,
+    offsets: Mapping[str, Sequence[float]] | None = None,
+    files: Mapping[str, str] | None = None,
+) -> Path:
     """Write a copy of a LeRobot data set (v3.0) with the poses of more frames.
 
     They are put behind what is in ``observation.environment_state``, seven values each, so that
@@ -165,6 +195,13 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
     frames : mapping of str to str, Path, Frame, sequence or mapping of Frame
         A table of poses, or frames that are given, as for :func:`load_lerobot`. Where a link is
         at an event can be learned without such a copy.
+    columns : mapping of str to Column, optional
+        Further columns.
+    offsets : mapping of str to sequence of float, optional
+        By the feature of joints, what is declared to be added to its values once they are in
+        radians or metres; the stored values stay.
+    files : mapping of str to str, optional
+        Further files, texts by their path in the copy.
 
     Returns
     -------
@@ -178,15 +215,7 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
         already, or its poses do not fit to the episodes. There is no copy then.
     """
     path, out = local_folder(path), Path(out)
-    layout = open_layout(path)
-    for problem in layout.problems:
-        raise problem
-    if layout.version != "v3.0" or not layout.episodes:
-        raise DatasetError(
-            f"frames are added to sets of v3.0, this is {layout.version} with "
-            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
-            "LeRobot's own converter, which keeps videos)"
-        )
+    layout = open_to_copy(path, out)
     sources = frame_sources(layout, frames, layout.episodes)
     if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
         raise DatasetError(
@@ -194,11 +223,17 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
             "LINK@EVENT and features are learned from the set as it is"
         )
     old = layout.features.get(ENVIRONMENT)
+    columns = dict(columns or {})
     declared = {ENVIRONMENT: with_frames(old, list(sources))}
+    declared |= {key: column.declared for key, column in columns.items()}
+    if there := columns.keys() & layout.features.keys():
+        raise DatasetError(f"the set has the columns {sorted(there)} already")
     features = {**layout.info["features"], **declared}
+    for key, shifts in (offsets or {}).items():
+        info = {**(features[key].get("info") or {}), "offsets": list(shifts)}
+        features[key] = {**features[key], "info": info}
     with replacing(out) as new:
-        if out.exists():
-            raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
+        open_to_copy(path, out)
         hidden = shutil.ignore_patterns(".*")
         shutil.copytree(path, new, ignore=hidden, copy_function=_link_videos)
         found = dict[int, Statistics]()
@@ -208,20 +243,25 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
             for rows in episodes:
                 values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
                 poses = stored_frames(layout, sources, rows)
-                column = frame_columns(values, poses, declared, rows.episode.index)
-                parts.append(feature_table(column, declared))
-                found[rows.episode.index] = episode_statistics(column)
-            _rewrite(path, new, file, {ENVIRONMENT: pa.concat_tables(parts)[ENVIRONMENT]})
+                index = rows.episode.index
+                added = frame_columns(values, poses, declared, index)
+                added |= {key: column.values[index] for key, column in columns.items()}
+                parts.append(feature_table(added, declared))
+                found[index] = episode_statistics(added)
+            table = pa.concat_tables(parts)
+            _rewrite(path, new, file, {key: table[key] for key in declared})
         whole = reduce(merge_statistics, found.values())
         for listed in (path / "meta" / "episodes").glob("*/*.parquet"):
             file = listed.relative_to(path)
-            index = read_columns(listed, path, ["episode_index"])["episode_index"].to_pylist()
-            columns = {}
-            for name in whole[ENVIRONMENT]:
-                key = f"stats/{ENVIRONMENT}/{name}"
-                listing = [found[number][ENVIRONMENT][name].tolist() for number in index]
-                columns[key] = pa.array(listing, _episode_type(key))
-            _rewrite(path, new, file, columns)
+            episodes = read_columns(listed, path, ["episode_index"])[
+                "episode_index"
+            ].to_pylist()
+            stats = {}
+            for feature, name in ((key, name) for key in whole for name in whole[key]):
+                key = f"stats/{feature}/{name}"
+                listing = [found[number][feature][name].tolist() for number in episodes]
+                stats[key] = pa.array(listing, _episode_type(key))
+            _rewrite(path, new, file, stats)
         meta = new / "meta"
         try:
             stored = {**json.loads((meta / "stats.json").read_text(encoding="utf-8"))}
@@ -229,7 +269,31 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
             raise DatasetError(f"no statistics: {error}", file="meta/stats.json") from error
         _write_json(meta / "stats.json", {**stored, **whole})
         _write_json(meta / "info.json", {**layout.info, "features": features})
+        for name, text in (files or {}).items():
+            (new / name).write_text(text, encoding="utf-8")
     return out
+
+
+def open_to_copy(path: Path, out: Path) -> Layout:
+    """The layout of a set to which :func:`add_frames` can add.
+
+    Raises
+    ------
+    DatasetError
+        If it is damaged, of another version or empty, or the folder of the copy exists.
+    """
+    layout = open_layout(path)
+    for problem in layout.problems:
+        raise problem
+    if layout.version != "v3.0" or not layout.episodes:
+        raise DatasetError(
+            f"frames are added to sets of v3.0, this is {layout.version} with "
+            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
+            "LeRobot's own converter, which keeps videos)"
+        )
+    if out.exists():
+        raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
+    return layout
 
 
 def _link_videos(source: str, target: str) -> None:

@@ -165,6 +165,8 @@ class ControlledEnv(StateEnv):
         cameras: str | Sequence[str],
         size: tuple[int, int] = (640, 480),
         imperfections: Imperfections | None = None,
+        carriers: Mapping[str, Carrier] | None = None,
+        objects: Mapping[str, str] | None = None,
     ) -> Rig:
         """Cameras before the scene, and tags on its objects and beside the table.
 
@@ -176,11 +178,14 @@ class ControlledEnv(StateEnv):
             Width and height of their pictures.
         imperfections : Imperfections, optional
             What spoils them.
+        carriers, objects : mapping, optional
+            Other tags than those, as for :class:`~lerobot_env_bimanual.eyes.rig.Rig`.
         """
         return Rig(
             self._scene,
             chosen_views(cameras),
-            {**CHECK, **self.carriers},
+            {**CHECK, **self.carriers} if carriers is None else carriers,
+            objects,
             camera=usual_camera(*size),
             imperfections=imperfections,
         )

@@ -13,29 +13,44 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.eyes.calibration import (
+    calibration_episode,
+    chain_of,
+    varied_postures,
+)
+from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.eyes.lens import Imperfections
 from lerobot_env_bimanual.eyes.recorder import CODECS, Recorder
+from lerobot_env_bimanual.eyes.views import CHECK
+from lerobot_env_bimanual.robot_scene import PALM_SIZE
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
 from tpgmm_torch import Demonstration
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
-__all__ = ["EXPERTS", "Expert", "expert", "main", "record"]
+__all__ = ["CALIBRATION", "EXPERTS", "Expert", "expert", "main", "record", "record_calibration"]
 
+Vector = NDArray[np.float64]
 #: Time steps per second of the experts' motions, whatever the rate of the set.
 RATE = 100.0
+#: The task of showing tags to the cameras, and by how much joints may be wrong then.
+CALIBRATION = "calibration"
+#: Tags in the hands that calibrate: the first number of each cube.
+IN_HAND = {"l_hand": 30, "r_hand": 40}
 #: Attempts for each episode that is asked for; experts fail seldom.
 ATTEMPTS = 3
 
@@ -97,7 +112,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
 
 BOTTLES = {
     "bottle_shaking": Expert(
-        BottleShakingEnv,
+        partial(BottleShakingEnv, track=True),
         lambda seed: BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(1, seed)[0],
         ("bottle",),
     ),
@@ -210,6 +225,76 @@ def record(
     return Path(out)
 
 
+def record_calibration(
+    out: str | Path,
+    *,
+    n: int = 30,
+    seed: int = 0,
+    cameras: str | Sequence[str] = "front",
+    fps: int = 25,
+    size: tuple[int, int] = (640, 480),
+    robot: str = UPPER_BODY,
+    hand: str = "r_hand",
+    codec: str = "av1",
+    offset_deg: float = 0.0,
+    noise_deg: float = 0.0,
+    imperfections: Imperfections | None = None,
+) -> Path:
+    """Let a robot of the suite show a cube of tags in its hand in varied postures.
+
+    Parameters
+    ----------
+    out, seed, cameras, fps, size, robot, codec, imperfections
+        As for :func:`record`; the postures are such that the first camera sees the tags.
+    n : int, default=30
+        How many postures.
+    hand : {"r_hand", "l_hand"}, default="r_hand"
+    offset_deg, noise_deg : float, default=0
+        Standard deviations of constant errors of the joints that move the hand, and of the
+        noise of each reading [deg]. The constant ones are ``joint_offsets`` of the cell file.
+
+    Returns
+    -------
+    Path
+        The folder, with the true ``cell.json`` in it.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the folder exists, an option is not one of the above, or so few postures show the
+        tags.
+    """
+    if hand not in HANDS:
+        raise UnknownNameError("hand", hand, "the recorder", HANDS)
+    env = expert("lid", robot).environment(fps=fps)
+    env.reset(seed=seed)
+    side = 1 if hand == "r_hand" else -1  # palms are turned to each other
+    cube = cube_at(IN_HAND[hand], y=side * (PALM_SIZE[1] + CUBE_ROOM))
+    rig = env.rig(cameras, size, imperfections, {**CHECK, hand: cube}, {})
+    rng = np.random.default_rng((seed, n))
+    postures = varied_postures(rig, hand, n, rng)
+    offsets = np.zeros(len(env.joint_names))
+    moved = chain_of(rig, hand)
+    offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved))
+    named = {env.joint_names[one]: round(float(offsets[one]), 7) for one in moved}
+    cell = {**rig.content(), "joints": list(env.joint_names)}
+    cell |= {"joint_offsets": named} if offset_deg else {}
+
+    def measured(joints: Vector) -> Vector:
+        return joints - offsets + np.radians(noise_deg) * rng.standard_normal(len(joints))
+
+    sizes = dict.fromkeys(rig.views, size)
+    with Recorder(
+        out, fps, env.joint_names, sizes, cell, robot_type=robot, codec=codec
+    ) as recorder:
+        calibration_episode(
+            recorder, rig, postures, rng, measured, lambda joints: joints - offsets
+        )
+    rig.close()
+    env.close()
+    return Path(out)
+
+
 def _follow(
     recorder: Recorder,
     env: ControlledEnv,
@@ -247,9 +332,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Record demonstrations with cameras as a LeRobot data set with videos.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--task", required=True, choices=EXPERTS, help="what is done")
+    parser.add_argument(
+        "--task", required=True, choices=(*EXPERTS, CALIBRATION),
+        help="what is done; calibration: tags in a hand are shown in varied postures",
+    )  # fmt: skip
     parser.add_argument("--out", required=True, help="folder of the set; it must not exist")
-    parser.add_argument("--n", type=int, default=10, help="episodes")
+    parser.add_argument("--n", type=int, default=10, help="episodes, or postures")
     parser.add_argument("--seed", type=int, default=0, help="of demonstrations and noise")
     parser.add_argument("--cameras", default="front", help="names, with commas between them")
     parser.add_argument("--fps", type=int, default=25, help="rows per second")
@@ -259,14 +347,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     parser.add_argument("--robot", choices=ROBOTS, default=UPPER_BODY, help="who does it")
     parser.add_argument("--codec", choices=CODECS, default="av1", help="of the videos")
-    parser.add_argument("--noise", type=float, default=0.0, help="of the sensors")
-    parser.add_argument(
+    shown = parser.add_argument_group("demonstrations")
+    shown.add_argument("--noise", type=float, default=0.0, help="of the sensors")
+    shown.add_argument(
         "--true-poses", action="store_true", help="record the poses of the objects too"
     )
-    options = vars(parser.parse_args(arguments))
+    moved = parser.add_argument_group("calibration")
+    moved.add_argument("--hand", choices=HANDS, default=HANDS[1], help="that has the tags")
+    moved.add_argument("--offset-deg", type=float, default=0.0, help="of the joints, constant")
+    moved.add_argument("--noise-deg", type=float, default=0.0, help="of the joints")
+    given = vars(parser.parse_args(arguments))
+    task, given["size"] = given.pop("task"), tuple(given["size"])
+    calibrates = task == CALIBRATION
+    for name in ("noise", "true_poses") if calibrates else ("hand", "offset_deg", "noise_deg"):
+        if given.pop(name) != parser.get_default(name):
+            parser.error(f"--{name.replace('_', '-')} is no option of the task {task}")
     _hush()
     try:
-        out = record(**options | {"size": tuple(options["size"])}, progress=_say)
+        out = (
+            record_calibration(**given) if calibrates else record(task, **given, progress=_say)
+        )
     except TPGMMError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

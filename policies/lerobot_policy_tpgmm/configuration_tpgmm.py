@@ -37,6 +37,9 @@ OLD = (
     "tpgmm fit --format lerobot"
 )
 
+#: In place of a cell: its cameras are not used.
+NO_CELL = "none"
+
 
 @dataclass
 class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
@@ -150,6 +153,11 @@ class TPGMMConfig(StatePolicyConfig):
         one another in ``observation.environment_state``.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
+    cell : dict or str, optional
+        The content of a cell file, to begin with its path, ``cell.json``. Frames are found in
+        the pictures of its cameras at each step, whatever ``observation.environment_state``
+        says, and joints are measured with its offsets. By default that of the data set, if it
+        was tracked; ``"none"`` reads poses from the observation.
     fps : float, optional
         Steps per second of the demonstrations.
     control_fps : float, optional
@@ -187,6 +195,7 @@ class TPGMMConfig(StatePolicyConfig):
     units: dict[str, list[float] | str] | str | None = None
     frames: dict[str, list[int | str]] | None = None
     default_environment_state: list[float] | None = None
+    cell: dict[str, Any] | str | None = None
     fps: float | None = None
     control_fps: float | None = None
     chunk_size: int = 50

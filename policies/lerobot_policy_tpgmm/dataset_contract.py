@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.eyes import take_over
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
+from tpgmm_datasets.signals import CELL
 from tpgmm_tools.cli.learning import operators_or_default
+from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
 
-__all__ = ["adopt", "check_dataset"]
+__all__ = ["adopt", "check_dataset", "declared"]
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +47,10 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
             setattr(config, field, _names(dataset.features, key))
     _check_rate(config, dataset)
     config.fps = float(dataset.fps)
+    if (file := Path(dataset.root) / CELL).exists():
+        config.cell = take_over(config.cell or str(file), json.loads(read_whole(file)))
     if config.units is None:
-        config.units = _units(config, dataset.features)
+        config.units = declared(config, dataset.features, "units")
     elif isinstance(config.units, str) and config.units.endswith(".json"):
         names = config.state_names or []
         scales = calibrated_units(config.units, tuple(names))
@@ -133,15 +140,15 @@ def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
         )
 
 
-def _units(config: TPGMMConfig, features: Mapping[str, Any]) -> dict[str, list[float] | str]:
-    """Units by name, where the data set declares them (this project's writer does)."""
-    units: dict[str, list[float] | str] = {}
+def declared(config: TPGMMConfig, features: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """Units or offsets by name, where the data set (of this project's writer) declares them."""
+    found: dict[str, Any] = {}
     for key in (OBS_STATE, ACTION):
-        declared = (features.get(key, {}).get("info") or {}).get("units")
+        values = (features.get(key, {}).get("info") or {}).get(what)
         names = getattr(config, NAMES[key])
-        if names and isinstance(declared, list) and len(declared) == len(names):
-            units |= dict(zip(names, declared, strict=True))
-    return units
+        if names and isinstance(values, list) and len(values) == len(names):
+            found |= dict(zip(names, values, strict=True))
+    return found
 
 
 def _frames(config: TPGMMConfig, kinematics: Kinematics, given: Sequence[Any]) -> list[str]:

@@ -45,6 +45,7 @@ def write_pretrained(model: Any, path: Path, signals: Signals) -> None:
         environment_names=signals.environment_names,
         frames={n: p for n, p in signals.frames.items() if n in skill.frame_names},
         units={name: list(scale) for name, scale in signals.units.items()} or None,
+        cell=signals.cell and str(signals.cell),
     )
     policy.save_pretrained(path)
 

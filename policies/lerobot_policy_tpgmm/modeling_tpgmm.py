@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,11 +14,12 @@ import torch
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
-from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
+from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig, state_features
+from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, declared
+from lerobot_policy_tpgmm.eyes import opened, take_over, watching
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
@@ -33,7 +35,7 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import consistent, recover
+from tpgmm_torch.atomic import consistent, read_whole, recover
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
@@ -160,6 +162,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             kinematics, operators = skill.kinematics, getattr(model, "operators_", ())
             required = (*skill.frame_names, *frame_names(config.via_operators(), kinematics))
         config.validate_features()
+        cell = opened(config)
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
         self._make_mixture(operators, model)
         names = self.kinematics.joint_names
@@ -170,8 +173,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._check_size("state_names", state_names, config.robot_state_feature)
         action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
+        offsets = {} if cell is None else cell.joint_offsets
+        if dataset_meta is not None:  # of a converted set they are none
+            offsets = declared(config, dataset_meta.features, "offsets")
         every = state_names, action_names, config.units
-        self.joints = JointFeatures(names, *every, self.kinematics)
+        self.joints = JointFeatures(names, *every, self.kinematics, offsets)
         if dataset_meta is not None and isinstance(self.kinematics, Robot):
             self.kinematics = self.kinematics.unlimited(self.joints.raw)
         environment = config.env_state_feature
@@ -181,6 +187,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(seen, config.frames, *named, default, width)
+        self.watch = watching(cell, self.kinematics, self.frames)
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -388,7 +395,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
         self._chunk: Chunk | None = None
-        self._ticks, self._statuses = TickDurations(), dict[int, Status]()
+        self._ticks, self._statuses = TickDurations(), dict[int, list[str]]()
+        self._stand: Any = None
+        self._ages: dict[str, Any] = {}  # what keeps robots from moving
+        if self.watch is not None:
+            self.watch.reset()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -400,7 +411,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``observation.state`` (B, n_state) and what the frames are read from; in the middle
             of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
             much time has passed [s], where it is there; what a tick comes late is caught up by
-            those that follow.
+            those that follow. With a cell, the pictures of its cameras (B, 3, height, width) in
+            [0, 1]: robots stand until all objects were seen.
 
         Returns
         -------
@@ -412,8 +424,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError, ShapeError
             If the observation is not what the policy was made for.
         """
+        batch = self._seen(batch, 1 / self.config.rate)
         if self._controller is None:
             self._controller = self._begin(batch)
+        if self._controller is None:
+            return self.joints.action(self._stand)
         return self.joints.action(self._step(self._controller, batch))
 
     @torch.no_grad()
@@ -443,6 +458,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         now = batch.get(TIMESTAMP)
         timestamp, last = None if now is None else float(now.flatten()[0]), self._chunk
+        batch, ahead = self._seen(batch, None if self._controller is None else 0.0), None
         if self._controller is not None:  # select_action says how far the episode is
             ahead = self._controller.copy()
         elif last is None:
@@ -453,10 +469,13 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ahead = last.first.resumed(
                 last.moments[passed], passed / self.config.rate, measured, poses
             )
+        if ahead is None:
+            return self.joints.action(self._stand)[:, None].repeat(1, self.config.chunk_size, 1)
         references = [self._step(ahead, batch, 1 / self.config.rate)]
-        moments, first, ahead = [ahead], ahead, ahead.ahead()
+        moments, first = [ahead], ahead
+        ahead = ahead.copy() if self._ages else ahead.ahead()
         while len(references) < self.config.chunk_size:
-            ahead.step(1 / self.config.rate)
+            ahead.step(1 / self.config.rate, ages=self._ages)
             references.append(ahead.reference.reshape(references[0].shape))
             moments.append(ahead.copy())
         joints = torch.stack(references, dim=1)
@@ -469,9 +488,33 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
         return True
 
-    def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
+    def _seen(self, batch: dict[str, Tensor], passed: float | None) -> dict[str, Tensor]:
+        """An observation with the poses that are seen in its pictures, if there is a cell."""
+        first = self._controller is None and self._chunk is None
+        if self.watch is None or not (first or self.config.control.follow_frames):
+            return batch
+        images = {k: v.numpy(force=True) for k, v in batch.items() if k.startswith(OBS_IMAGES)}
+        now, joints = batch.get(TIMESTAMP), self._observed(batch).numpy(force=True)
+        times = None if now is None else now.flatten().numpy(force=True)
+        self.watch.look(images, joints, passed, times)
+        found, self._ages = (
+            self.watch.first() if first else self.watch.poses(),
+            self.watch.ages(),
+        )
+        return self.frames.with_poses(batch, found)
+
+    def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
+        """A running skill; None while robots stand because not all objects were seen."""
         check_rate(batch, self.config.rate)
-        joints, frames = self._observed(batch), self.frames.frames(batch)
+        joints = self._observed(batch)
+        if self.watch is not None:
+            self._stand = joints = joints if self._stand is None else self._stand
+            if missing := self.watch.missing():
+                if missing != self._statuses.get(-1):
+                    log.info("%s before the start: %s", Status.HOLDING, "; ".join(missing))
+                self._statuses[-1] = missing
+                return None
+        frames = self.frames.frames(batch)
         if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return Controller(self.skill, joints, frames, **self.config.control.options())
@@ -501,7 +544,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         start, first = controller.reference, controller.command is None
         measured = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
-        command = controller.step(float(passed) if start.ndim == 1 else passed, *measured)
+        passed = float(passed) if start.ndim == 1 else passed
+        command = controller.step(passed, *measured, ages=self._ages)
         if first:
             self._check_start(start, command.estimate.joints)
         self._log(command)
@@ -512,11 +556,17 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         several = command.codes.ndim > 0
         times = command.time.expand(command.codes.shape).flatten().tolist()
         for robot, status in enumerate(command.status if several else [command.status]):
-            if status != self._statuses.get(robot, Status.RUNNING):
-                reason = command.reason(robot if several else ())
+            reason, told = command.reason(robot if several else ()), [str(status)]
+            if self.watch is not None:
+                unseen = self.watch.unseen(robot)
+                reason, told = (
+                    "; ".join(filter(None, (reason, *unseen.values()))),
+                    [*told, *unseen],
+                )
+            if told != self._statuses.get(robot, [Status.RUNNING]):
                 what = f"{status}: {reason}" if reason else status
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
-            self._statuses[robot] = status
+            self._statuses[robot] = told
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
         """Seconds for which the next reference is."""
@@ -663,6 +713,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                     config or PreTrainedConfig.from_pretrained(folder, **options),
                 ),
             )
+            if learned := json.loads(read_whole(folder / CONFIG_NAME)).get("cell"):
+                config.cell = take_over(config.cell or NO_CELL, learned)
             policy = cls(config, model=model, **options).eval().to(config.device)
             validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -53,6 +54,8 @@ class JointFeatures(nn.Module):
         As in :class:`TPGMMConfig`; by the name of an entry or of a joint.
     robot : Kinematics, optional
         Whose limits grippers in LeRobot's units have.
+    offsets : mapping of str to float, optional
+        What is added to values in radians to be joints of the robot's description [rad].
 
     Attributes
     ----------
@@ -77,6 +80,7 @@ class JointFeatures(nn.Module):
         action_names: Sequence[str],
         units: Mapping[str, Sequence[float] | str] | str | None,
         robot: Kinematics | None = None,
+        offsets: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         super().__init__()
         self.joint_names = tuple(joint_names)
@@ -98,6 +102,8 @@ class JointFeatures(nn.Module):
         chosen = units_of(_scales(units), every, called, robot, OBS_STATE)
         self.raw = {name for name, unit in zip(called, chosen, strict=True) if unit == "raw"}
         scales = [as_scale(unit, name) for name, unit in zip(every, chosen, strict=True)]
+        added = [offsets.get(n, offsets.get(m, 0)) for n, m in zip(called, every, strict=True)]
+        scales = [Scale(s.factor, s.offset + x) for s, x in zip(scales, added, strict=True)]
         state = [scales[every.index(entry[joint])] for joint in joint_names]
         action = scales[len(state_names) :]
         buffers = {
@@ -229,6 +235,15 @@ class FrameFeatures:
             except DataError as error:
                 raise DataError(f"frame {name!r}: {error}") from error
         return frames
+
+    def with_poses(self, batch: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+        """An observation in which frames are at poses (B, 7) that were ``found``."""
+        nothing = torch.full((self.n_environment,), math.nan, dtype=torch.float64)
+        known = nothing if self.default is None else self.default
+        environment = known.repeat(len(batch[OBS_STATE]), 1)
+        for name, poses in found.items():
+            environment[:, self.in_environment[name]] = torch.from_numpy(poses)
+        return {**batch, OBS_ENV_STATE: environment.to(batch[OBS_STATE].device)}
 
     def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
         """The same in the middle of an episode: (B, 7), of any values; None for a lost one."""

@@ -50,6 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("poses",),
         ("camera", "targets", "sources"),
         ("cell",),
+        ("detection", "watching"),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),
@@ -59,18 +60,20 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_policy_tpgmm": (
         ("settings", "tick_durations"),
         ("configuration_tpgmm",),
-        ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
-        ("policy_files", "training"),
+        ("processor_tpgmm", "observations", "mixture_parameters"),
+        ("eyes",),
+        ("dataset_contract", "policy_files", "training"),
         ("modeling_tpgmm",),
         ("lerobot_format", "async_server"),
     ),
     "lerobot_env_bimanual": (
         ("control_rate", "disturbances", "rendering"),
         ("base", "robot_scene"),
-        ("start",),
+        ("eyes", "start"),
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),
+        ("record",),
     ),
     "tpgmm_evaluation": (
         ("benchmarks", "policies", "processes", "variants"),

@@ -272,7 +272,8 @@ class Controller:
             Which link holds an object from now on, None if it is free from now on: in place
             of the holds that the skill began with.
         ages : mapping of str to float, optional
-            How old ``"joints"`` and the frames are [s].
+            How old ``"joints"`` and the frames are [s]; infinite for what else holds robots,
+            a reason in words.
 
         Returns
         -------

@@ -206,7 +206,7 @@ class Inputs:
             for name, age in self.ages.items():
                 old = float(np.broadcast_to(age, robots.shape)[index])
                 if not old <= self._timeout(name):
-                    parts.append(f"{name} is {old:.2g} s old")
+                    parts.append(name if old == np.inf else f"{name} is {old:.2g} s old")
             texts[index] = "; ".join(parts)
         return texts
 

@@ -39,12 +39,16 @@ import numpy as np
 from tpgmm_torch.atomic import read_whole, replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, pose_matrix, pose_vector
+from tpgmm_vision.poses import Array, angle_between, pose_matrix, pose_vector
 from tpgmm_vision.targets import Target, target_from
 
 __all__ = [
-    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "read_cell", "write_cell",
+    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "cell_of", "read_cell",
+    "write_cell",
 ]  # fmt: skip
+
+#: Poses that are nearer to each other are the same: [mm], [deg].
+SAME_PLACE, SAME_ANGLE = 0.1, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +136,32 @@ class Cell:
     source: str = "tags"
     content: Mapping[str, Any] = field(default_factory=dict)
 
+    def differences(self, other: Cell) -> list[str]:
+        """What is another one in another cell, in words, one for each thing."""
+        told = []
+        for kind in ("cameras", "objects", "checks"):
+            one, two = getattr(self, kind), getattr(other, kind)
+            told += [f"{name!r} of the {kind} is missing" for name in one.keys() - two]
+            told += [f"{name!r} of the {kind} is new" for name in two.keys() - one]
+            for name in sorted(one.keys() & two):
+                before, after = (cell.content[kind][name] for cell in (self, other))
+                keys = sorted({*before, *after} - {"pose", "report"})
+                changed = [key for key in keys if before.get(key) != after.get(key)]
+                if changed:
+                    told.append(f"{name!r} of the {kind} has another {' and '.join(changed)}")
+                told += _moved(f"{name!r} of the {kind}", one[name].pose, two[name].pose)
+        shifts = self.shifts(other).items()
+        return told + [
+            f"joint {name!r} is offset by {math.degrees(shift):+.2f} deg more"
+            for name, shift in shifts
+        ]
+
+    def shifts(self, other: Cell) -> dict[str, float]:
+        """By how much the offsets of joints are larger in another cell [rad]."""
+        one, two = self.joint_offsets, other.joint_offsets
+        shifts = {name: two.get(name, 0.0) - one.get(name, 0.0) for name in {**one, **two}}
+        return {name: shift for name, shift in shifts.items() if shift}
+
     @property
     def links(self) -> tuple[str, ...]:
         """Links that carry cameras."""
@@ -154,6 +184,22 @@ class Cell:
                 else "the cell has no cameras: tpgmm calibrate camera adds one"
             )
         return dict(self.cameras)
+
+
+def _moved(what: str, before: Array | None, after: Array | None) -> list[str]:
+    """How far something is from where it was, if it is."""
+    if before is None or after is None:
+        return []
+    moved = 1e3 * float(np.linalg.norm(before[:3, 3] - after[:3, 3]))
+    turned = math.degrees(angle_between(before, after))
+    if moved < SAME_PLACE and turned < SAME_ANGLE:
+        return []
+    return [f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg"]
+
+
+def cell_of(given: Mapping[str, Any] | str | Path) -> Cell:
+    """The cell of a file, or of its content."""
+    return cell_from(given) if isinstance(given, Mapping) else read_cell(given)
 
 
 def read_cell(path: str | Path) -> Cell:

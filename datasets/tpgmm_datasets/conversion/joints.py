@@ -14,7 +14,7 @@ from tpgmm_datasets.errors import DatasetError, DatasetWarning
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, Layout
 from tpgmm_datasets.names import NAME_ALL, match_names
-from tpgmm_datasets.units import Unit, Units, as_scale, convert, units_of
+from tpgmm_datasets.units import Scale, Unit, Units, as_scale, convert, shifted, units_of
 from tpgmm_torch.checks.report import Finding
 
 __all__ = ["JointColumns", "commanded_joints", "joint_feature", "names_of"]
@@ -62,6 +62,11 @@ class JointColumns:
         return cls(feature, final, _units(feature, final, units, robot))
 
     @property
+    def scales(self) -> list[Scale]:
+        """What brings each stored value to radians or metres, declared offsets included."""
+        return shifted(self.units, self.feature.offsets, self.feature.key)
+
+    @property
     def raw(self) -> set[str]:
         """Names of the values that are taken as they are."""
         named = zip(self.names or (), self.units, strict=False)
@@ -70,7 +75,8 @@ class JointColumns:
     def values(self, stored: np.ndarray[Any, Any], **where: Any) -> np.ndarray[Any, Any]:
         """Stored values (T, width) in radians and metres."""
         called = self.feature.names or self.names or self.feature.called
-        return convert(stored, called, self.units, self.feature.key, **where)
+        values = convert(stored, called, self.units, self.feature.key, **where)
+        return values if self.feature.offsets is None else values + self.feature.offsets
 
 
 def joint_feature(layout: Layout, joints: str | None = None) -> str:

@@ -20,7 +20,7 @@ from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_datasets.names import value_names
 from tpgmm_torch.atomic import read_whole
 
-__all__ = ["Episode", "Feature", "Layout", "open_layout"]
+__all__ = ["Episode", "Feature", "Layout", "episode_file", "open_layout"]
 
 #: Columns that LeRobot keeps for itself.
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -60,6 +60,9 @@ class Feature:
         One unit per value, where the metadata tell (those of this project's writer do).
     misnamed : str
         Why the names cannot be used.
+    offsets : tuple of float or None
+        What is added to each value once it is in radians or metres, where the metadata of a
+        tracked set tell: how far the motors are from the joints of the robot's description.
     """
 
     key: str
@@ -68,6 +71,7 @@ class Feature:
     names: tuple[str, ...] | None = None
     units: tuple[str, ...] | None = None
     misnamed: str = ""
+    offsets: tuple[float, ...] | None = None
 
     @property
     def width(self) -> int:
@@ -253,7 +257,18 @@ def _feature(key: str, entry: Any) -> Feature:
     if wrong:
         message = f"its units cannot be used, {wrong}: mend them, or leave them out"
         raise DatasetError(message, file=INFO, column=key)
-    return Feature(key, dtype, tuple(sizes), names, listed, misnamed)
+    offsets = extra.get("offsets") if isinstance(extra, dict) else None
+    if offsets is not None and not _numbers(offsets, width):
+        message = f"its joint offsets are {width} numbers in radians, got {str(offsets)[:80]}"
+        raise DatasetError(message, file=INFO, column=key)
+    shifts = None if offsets is None else tuple(map(float, offsets))
+    return Feature(key, dtype, tuple(sizes), names, listed, misnamed, shifts)
+
+
+def _numbers(values: Any, count: int) -> bool:
+    """Whether these are so many finite numbers."""
+    whole = isinstance(values, list) and len(values) == count
+    return whole and all(type(one) in (int, float) and math.isfinite(one) for one in values)
 
 
 def _listed_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -291,33 +306,60 @@ def _episode(
     if modern and (stop := row["dataset_to_index"]) - start != length:
         message = f"the length is {length} but the rows go from {start} to {stop}"
         raise DatasetError(message, file=place, episode=index)
-    return Episode(index, length, tuple(tasks), _data_file(info, row, modern), start)
+    numbers = (row["data/chunk_index"], row["data/file_index"]) if modern else None
+    file = episode_file(info, "data_path", index, numbers)
+    return Episode(index, length, tuple(tasks), file, start)
 
 
-def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) -> Path:
-    template = info.get("data_path")
-    size = info.get("chunks_size", 1000)
+def episode_file(
+    info: Mapping[str, Any],
+    template: str,
+    index: int,
+    place: tuple[int, int] | None,
+    **texts: str,
+) -> Path:
+    """The file of an episode, relative to the root, by a template in ``info.json``.
+
+    Parameters
+    ----------
+    info : mapping
+        ``info.json`` as it is.
+    template : str
+        ``"data_path"`` or ``"video_path"``.
+    index : int
+        Of the episode.
+    place : (int, int) or None
+        Numbers of chunk and file in v3.0; None in v2.1, where an episode has its own file.
+    **texts : str
+        Further fields of the template: ``video_key``.
+
+    Raises
+    ------
+    DatasetError
+        If there is no such template, or it leads out of the set.
+    """
+    text, size = info.get(template), info.get("chunks_size", 1000)
     if type(size) is not int or size < 1:
         raise DatasetError(f"chunks_size is {size!r}", file=INFO)
-    index = row["episode_index"]
-    chunk = row["data/chunk_index"] if modern else index // size
+    chunk, number = place or (index // size, index)
     numbers = {
         "episode_index": index,
         "episode_chunk": chunk,
         "chunk_index": chunk,
-        "file_index": row["data/file_index"] if modern else index,
+        "file_index": number,
     }
     # no attributes, and no width that would fill the memory
-    fields = rf"({{({'|'.join(numbers)})(:0?\d?\dd)?}}|[^{{}}])+"
-    if not isinstance(template, str) or not re.fullmatch(fields, template):
+    plain = "|".join(["[^{}]", *(f"{{{name}}}" for name in texts)])
+    fields = rf"({{({'|'.join(numbers)})(:0?\d?\dd)?}}|{plain})+"
+    if not isinstance(text, str) or not re.fullmatch(fields, text):
         raise DatasetError(
-            f"data_path {template!r} cannot be filled in: it has fields like "
-            f"{{chunk_index:03d}}, of {sorted(numbers)}",
+            f"{template} {text!r} cannot be filled in: it has fields like "
+            f"{{chunk_index:03d}}, of {sorted({**numbers, **texts})}",
             file=INFO,
         )
-    file = Path(template.format(**numbers))
+    file = Path(text.format(**numbers, **texts))
     if file.is_absolute() or ".." in file.parts or "\0" in str(file):
-        raise DatasetError(f"data_path {template!r} leaves the set", file=INFO)
+        raise DatasetError(f"{template} {text!r} leaves the set", file=INFO)
     return file
 
 

@@ -43,7 +43,7 @@ class Carrier:
     Parameters
     ----------
     entry : mapping
-        The target as a cell file describes it: ``{"cube": [10, 11, 12, 13, 14], "size": 0.04}``.
+        The target as a cell file describes it, ``{"tag": 3, "size": 0.06}``.
     pose : ndarray of shape (4, 4)
         Of the target in the frame of the body.
     upright : bool, default=False

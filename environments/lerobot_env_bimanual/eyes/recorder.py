@@ -83,7 +83,8 @@ class Recorder:
         names = list(joint_names)
         units = ["rad"] * len(names) if units is None else list(units)
         joints = {
-            "dtype": "float32", "shape": (len(names),), "names": names, "info": {"units": units},
+            "dtype": "float32", "shape": (len(names),), "names": names,
+            "info": {"units": units},
         }  # fmt: skip
         kind = "image" if CODECS[codec] is None else "video"
         self._features: dict[str, Any] = {"observation.state": joints, "action": joints}
@@ -118,7 +119,7 @@ class Recorder:
                 use_videos=codec is not None,
                 rgb_encoder=codec and RGBEncoderConfig(vcodec=codec),
                 streaming_encoding=codec is not None,
-                encoder_queue_maxsize=0,  # no limit: LeRobot drops what a full queue does not take
+                encoder_queue_maxsize=0,  # what a full queue does not take would be dropped
             )
             self._new = new
             self._closing = stack.pop_all()

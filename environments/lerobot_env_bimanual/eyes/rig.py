@@ -23,6 +23,8 @@ __all__ = ["IMAGES", "Rig", "View", "looking"]
 
 #: How LeRobot names the features of cameras.
 IMAGES = "observation.images."
+#: How near to a point what is hit by a ray towards it is what the point is on [m].
+SURFACE = 0.002
 #: OpenCV's camera looks along z, y down; MuJoCo's along -z, y up.
 _TURNED = rigid(np.diag((1.0, -1.0, -1.0)), np.zeros(3))
 
@@ -65,11 +67,13 @@ class Rig:
     views : mapping of str to View
         The cameras by their names.
     carriers : mapping of str to Carrier
-        By the body that carries the tags; ``"world"``, or a link of the robot that stands
-        still, carries tags that check.
+        The tags, by the bodies that carry them; ``"world"`` is what stands still.
     objects : mapping of str to str, optional
-        Which bodies are objects, and their names in the cell; by default each carrier but
-        ``"world"``, under its own name. The others check.
+        Bodies whose carriers are objects of the cell, and their names there; by default all
+        but ``"world"``, under their own names.
+    checks : mapping of str to str, optional
+        The same of carriers that stand still, by which a camera that was moved is noticed;
+        ``{"world": "base"}`` by default. What is neither is drawn alone: a tag in a hand.
     camera : Camera, optional
         Of all views; that of :func:`~lerobot_env_bimanual.eyes.lens.usual_camera` by default.
     imperfections : Imperfections, optional
@@ -89,18 +93,23 @@ class Rig:
         views: Mapping[str, View],
         carriers: Mapping[str, Carrier],
         objects: Mapping[str, str] | None = None,
+        checks: Mapping[str, str] | None = None,
         camera: Camera | None = None,
         imperfections: Imperfections | None = None,
     ) -> None:
         self.scene, self.views, self.carriers = scene, dict(views), dict(carriers)
-        known = {body: body for body in self.carriers if body != "world"}
-        self.objects = known if objects is None else dict(objects)
+        if objects is None:
+            objects = {body: body for body in carriers if body != "world"}
+        if checks is None:
+            checks = {"world": "base"} if "world" in carriers else {}
+        self.objects, self.checks = dict(objects), dict(checks)
         self.lens = Lens(camera or usual_camera())
         self.imperfections = imperfections or Imperfections()
         spec = scene.spec.copy()
         there = [body.name for body in spec.bodies]
         links = [view.link for view in self.views.values() if view.link is not None]
-        if missing := {*self.carriers, *links} - {*there}:
+        named = {*self.carriers, *links, *self.objects, *self.checks}
+        if missing := named - {*there}:
             raise DataError(f"the scene has no bodies {sorted(missing)}; it has {there}")
         for body, carrier in self.carriers.items():
             add_carrier(spec, body, carrier)
@@ -168,19 +177,36 @@ class Rig:
             }
             for name, view in self.views.items()
         }
-        objects, checks = dict[str, Any](), dict[str, Any]()
-        for body, carrier in self.carriers.items():
-            entry = {"target": dict(carrier.entry)}
-            if body in self.objects:
-                entry["pose"] = pose_content(inverse(carrier.pose))
-                objects[self.objects[body]] = entry | (
-                    {"upright": True} if carrier.upright else {}
-                )
-            else:
-                checks["base" if body == "world" else body] = entry | {
-                    "pose": pose_content(self.pose(body) @ carrier.pose)
-                }
+        objects = {
+            name: {
+                "target": dict(self.carriers[body].entry),
+                "pose": pose_content(inverse(self.carriers[body].pose)),
+                **({"upright": True} if self.carriers[body].upright else {}),
+            }
+            for body, name in self.objects.items()
+        }
+        checks = {
+            name: {
+                "target": dict(self.carriers[body].entry),
+                "pose": pose_content(self.pose(body) @ self.carriers[body].pose),
+            }
+            for body, name in self.checks.items()
+        }
         return {"cameras": cameras, "objects": objects, "checks": checks}
+
+    def camera_pose(self, camera: str) -> Array:
+        """Where a camera is in the world (4, 4)."""
+        view = self.views[camera]
+        return view.pose if view.link is None else self.pose(view.link) @ view.pose
+
+    def in_sight(self, camera: str, point: ArrayLike) -> bool:
+        """Whether nothing hides a point (3,) of the camera's frame, but what it is on [m]."""
+        self._follow()
+        pose, point = self.camera_pose(camera), np.asarray(point, dtype=float)
+        distance, hit = float(np.linalg.norm(point)), np.zeros(1, np.int32)
+        ray = pose[:3, :3] @ point / distance
+        found = mujoco.mj_ray(self._model, self._data, pose[:3, 3], ray, None, 1, -1, hit)
+        return found < 0 or found > distance - SURFACE
 
     def pose(self, body: str) -> Array:
         """Where a body is (4, 4)."""

@@ -17,7 +17,7 @@ __all__ = ["CHECK", "VIEWS", "around", "chosen_views"]
 #: The middle of what happens on the table [m].
 CENTRE = (0.28, 0.0, 0.15)
 #: Tags that stand still beside the table, as they would at the base of the robot.
-CHECK: Mapping[str, Carrier] = {"world": cube_at(0, 0.3, 0.43, 0.05)}
+CHECK: Mapping[str, Carrier] = {"world": cube_at(0, 0.3, 0.43, 0.05, size=0.06)}
 
 
 def around(centre: ArrayLike, distance: float, azimuth: float, elevation: float) -> View:

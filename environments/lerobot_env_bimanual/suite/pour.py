@@ -52,6 +52,8 @@ BOX = Box((0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0)
 #: Where the palms touch them, and where they wait, in their frames [m].
 GRIP = {"l_hand": (0.0, JUG + 0.01, 0.01), "r_hand": (0.0, -CUP - 0.01, 0.0)}
 WAIT = {"l_hand": (-0.05, 0.1, 0.01), "r_hand": (-0.05, -0.1, 0.0)}
+#: The jug's tags are at its lower end, which is away from the cup's when it is tilted [m].
+LOW = -0.03
 #: How high the jug is lifted before it is carried [m].
 LIFT = 0.05
 #: Where the cup is held [m], and by how much it sways from there while it is poured into.
@@ -85,7 +87,7 @@ class Pour(SuiteTask):
     }  # fmt: skip
     carriers: ClassVar = {
         "cup": cube_at(10, CUP + CUBE_ROOM),
-        "jug": cube_at(20, JUG + CUBE_ROOM),
+        "jug": cube_at(20, JUG + CUBE_ROOM, z=LOW),
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)

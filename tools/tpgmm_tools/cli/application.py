@@ -25,8 +25,9 @@ HELP = {
     "fit": "Learn a skill from a LeRobot data set.",
     "app": "Learn and look in the browser: a data set in, a moving picture out.",
 }
-#: Packages of the extra ``cli``.
-OPTIONAL = ("matplotlib", "pandas", "pyarrow")
+#: Extras by the packages that come with them.
+OPTIONAL = dict.fromkeys(("matplotlib", "pandas", "pyarrow"), "cli")
+OPTIONAL |= dict.fromkeys(("cv2", "av"), "vision")
 
 
 class Commands(TyperGroup):
@@ -97,7 +98,8 @@ def explain(error: Exception) -> str | None:
     if isinstance(error, typer.Abort):
         return "aborted"
     if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL:
-        return f"this command needs {error.name}: pip install 'tpgmm-torch[cli]'"
+        extra = OPTIONAL[error.name]
+        return f"this command needs {error.name}: pip install 'tpgmm-torch[{extra}]'"
     from tpgmm_torch.exceptions import PlausibilityWarning, TPGMMError
 
     expected = isinstance(error, TPGMMError | OSError | PlausibilityWarning)

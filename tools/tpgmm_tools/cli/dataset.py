@@ -263,6 +263,60 @@ def add_frames(path: str, *, frame: list[str], out: Path) -> None:
     typer.echo(f"{', '.join(frames)} added to the copy {out}")
 
 
+@options.command(
+    app, "tpgmm dataset track arm tracked --cell cell.json --robot so101 --units lerobot"
+)
+def track(
+    path: str,
+    out: Path,
+    *,
+    cell: Path,
+    described: options.RobotOptions,
+    units: list[str] | None = None,
+    joint_name: list[str] | None = None,
+) -> None:
+    """Write a copy of a data set (v3.0) with the objects that its own pictures show.
+
+    Their poses are put into observation.environment_state, where lerobot-train and 'tpgmm fit'
+    find them; tracking.seen and tracking.known say where they were measured, and where they
+    were measured or inferred. Videos are linked or copied; report.html in the copy shows what
+    was found. With a robot, what a hand carries is known while it is covered.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set: its folder.
+    out : ``DIR``
+        Folder of the copy.
+    cell : ``CELL.json``
+        Cameras, objects and joint offsets, as 'tpgmm calibrate' writes them.
+    units : ``[JOINT=]UNIT``
+        Unit of the stored joints, as of 'tpgmm fit', repeatable.
+    joint_name : ``STORED=JOINT``
+        The robot's name of a stored joint, as of 'tpgmm fit', repeatable.
+    """
+    from rich.progress import Progress
+
+    from tpgmm_torch.checks.report import in_columns
+    from tpgmm_vision.episodes.report import table
+    from tpgmm_vision.episodes.tracking import track_lerobot
+
+    robot = described.read()
+    given = options.DataOptions(units=units, joint_name=joint_name).arguments(robot)
+    reading = {
+        key: given[key] for key in ("units", "calibration", "joint_names") if key in given
+    }
+    with Progress() as bar:
+        task = bar.add_task("tracking")
+
+        def advance(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        reports = track_lerobot(path, out, cell, robot, **reading, progress=advance)
+    typer.echo(in_columns(table(reports)))
+    typer.echo(f"{len(reports)} episodes tracked in the copy {out}; look at {out}/report.html")
+
+
 def _tasks(episodes: Sequence[Episode]) -> list[str]:
     """The task of each episode, of which it must have one."""
     from tpgmm_torch.exceptions import DataError

@@ -1,4 +1,4 @@
-"""The pose of a target from the corners of its tags, with its uncertainty, or why there is none.
+"""The pose of a target from the corners of its tags, its uncertainty, or why there is none.
 
 A flat tag that is seen from the front has two poses that explain its corners nearly as well.
 All such hypotheses of all tags are fitted to all corners by Gauss-Newton; a pose is only valid
@@ -8,7 +8,7 @@ if the next best one explains them clearly worse.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -76,6 +76,8 @@ class PoseEstimate:
         Why it is not valid.
     tags : tuple of int
         Those that count.
+    alternative : ndarray of shape (4, 4), optional
+        The other pose, where two explain what is seen.
     """
 
     pose: Array
@@ -84,6 +86,7 @@ class PoseEstimate:
     valid: bool
     reason: str
     tags: tuple[int, ...]
+    alternative: Array | None = None
 
 
 def estimate_pose(
@@ -111,15 +114,16 @@ def estimate_pose(
         None if no tag of the target is seen.
     """
     problem = _Problem.of(views, target)
-    while problem.tags:
-        free = problem.best(None)
-        known = upright, height
-        fit = free
+    while problem.seen:
+        fit = None
         if upright or height is not None:
-            bound = problem.best(known)
-            if bound.cost - free.cost < MOST_MISFIT**2:
-                fit = bound
-        misfit = fit.cost / max(problem.numbers - 6, 1)
+            fit = problem.best((upright, height))
+            if fit.cost > problem.freedom + MOST_MISFIT**2 and (
+                fit.cost > (free := problem.best(None)).cost + MOST_MISFIT**2
+            ):
+                fit = free
+        fit = fit or problem.best(None)
+        misfit = fit.cost / problem.freedom
         if misfit <= MOST_MISFIT**2 or len(problem.tags) == 1:
             return problem.judged(fit, misfit)
         problem = problem.without(problem.worst(fit.pose))
@@ -128,82 +132,124 @@ def estimate_pose(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A hypothesis that was fitted, and how well the next best fits."""
+    """A hypothesis that was fitted, and the next best."""
 
     pose: Array
     cost: float
     information: Array
-    second: float
+    second: _Fit | None = None
 
 
 @dataclass(frozen=True)
-class _Corners:
-    """The corners of one tag in one view, and what whitens them."""
+class _Seen:
+    """The corners of a target's tags in one view.
+
+    ``points`` (n, 4, 3) in the target's frame, ``pixels`` (n, 4, 2), and matrices (n, 8, 8)
+    that whiten them.
+    """
 
     view: View
-    number: int
+    numbers: tuple[int, ...]
     points: Array
-    seen: Array
+    pixels: Array
     whiten: Array
+
+    @classmethod
+    def of(cls, view: View, target: Target, numbers: Sequence[int]) -> _Seen:
+        """Some tags of the target."""
+        usual = CORNER_STD**2 * np.eye(8)
+        given = [(view.covariances or {}).get(number, usual) for number in numbers]
+        return cls(
+            view,
+            tuple(numbers),
+            np.array([target.corners[number] for number in numbers]),
+            np.array([view.corners[number] for number in numbers]),
+            np.linalg.inv(np.linalg.cholesky(np.array(given))),
+        )
+
+    def without(self, number: int) -> _Seen:
+        """The same without a tag."""
+        kept = [one != number for one in self.numbers]
+        left = tuple(one for one in self.numbers if one != number)
+        return _Seen(self.view, left, self.points[kept], self.pixels[kept], self.whiten[kept])
+
+    def errors(self, pose: Array) -> Array:
+        """Expected less seen corners (n, 4, 2) [pixels]."""
+        points = transformed(self._from_base @ pose, self.points.reshape(-1, 3))
+        return self.view.camera.project(points).reshape(-1, 4, 2) - self.pixels
+
+    @property
+    def _from_base(self) -> Array:
+        return inverse(self.view.base_from_camera)
+
+    def residual(self, pose: Array) -> tuple[Array, Array]:
+        """The errors (n, 8) in standard deviations, and how the pose moves them (n, 8, 6)."""
+        n, camera_from_base = len(self.numbers), self._from_base
+        turned = self.points.reshape(-1, 3) @ pose[:3, :3].T
+        points = transformed(camera_from_base, turned + pose[:3, 3])
+        if (points[:, 2] < 1e-3).any():  # behind the camera
+            return np.full((n, 8), 1e3), np.zeros((n, 8, 6))
+        pixels, rates = self.view.camera.projected(points)
+        rates = rates @ camera_from_base[:3, :3]
+        (x, y, z), zero = turned.T, np.zeros(len(turned))
+        # d (w x p) / d w = -[p]x
+        cross = np.stack((zero, z, -y, -z, zero, x, y, -x, zero), axis=-1).reshape(-1, 3, 3)
+        moved = np.concatenate((rates, rates @ cross), axis=-1).reshape(n, 8, 6)
+        error = pixels.reshape(n, 8) - self.pixels.reshape(n, 8)
+        return np.einsum("nij,nj->ni", self.whiten, error), self.whiten @ moved
 
 
 @dataclass(frozen=True)
 class _Problem:
     """All corners of a target."""
 
-    corners: tuple[_Corners, ...]
+    seen: tuple[_Seen, ...]
 
     @classmethod
     def of(cls, views: Sequence[View], target: Target) -> _Problem:
         """Those of the target's tags."""
-        found = []
-        for view in views:
-            for number in sorted(view.corners.keys() & target.corners.keys()):
-                covariance = (view.covariances or {}).get(number, CORNER_STD**2 * np.eye(8))
-                whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-                points, seen = target.corners[number], view.corners[number]
-                found.append(_Corners(view, number, points, seen, whiten))
-        return cls(tuple(found))
+        found = [(view, sorted(view.corners.keys() & target.corners.keys())) for view in views]
+        return cls(tuple(_Seen.of(view, target, tags) for view, tags in found if tags))
 
     @property
     def tags(self) -> tuple[int, ...]:
         """Numbers of the tags."""
-        return tuple(dict.fromkeys(one.number for one in self.corners))
+        return tuple(dict.fromkeys(number for one in self.seen for number in one.numbers))
 
     @property
-    def numbers(self) -> int:
-        """How many numbers are known."""
-        return 8 * len(self.corners)
+    def freedom(self) -> int:
+        """How many numbers are known beyond those of a pose."""
+        return 8 * sum(len(one.numbers) for one in self.seen) - 6
 
     def without(self, number: int) -> _Problem:
         """The same without a tag."""
-        return _Problem(tuple(one for one in self.corners if one.number != number))
+        left = (one.without(number) for one in self.seen)
+        return _Problem(tuple(one for one in left if one.numbers))
 
     def worst(self, pose: Array) -> int:
         """The tag that fits a pose worst."""
         costs = dict.fromkeys(self.tags, 0.0)
-        for one in self.corners:
-            residual, _ = _residual(one, pose)
-            costs[one.number] += float(residual @ residual)
+        for one in self.seen:
+            for number, errors in zip(one.numbers, one.residual(pose)[0], strict=True):
+                costs[number] += float(errors @ errors)
         return max(costs, key=lambda number: costs[number])
 
     def best(self, known: tuple[bool, float | None] | None) -> _Fit:
         """The hypothesis that fits best."""
-        guesses = [pose for one in self.corners for pose in _hypotheses(one)]
+        guesses = [pose for one in self.seen for pose in _hypotheses(one)]
         costs = [self.system(pose, known)[0] for pose in guesses]
         order = np.argsort(costs)
         first = self.descended(guesses[order[0]], known)
         rivals = [
             guesses[k] for k in order[1:] if angle_between(guesses[k], first.pose) > DISTINCT
         ]
-        second = np.inf
         if rivals:
             other = self.descended(rivals[0], known)
             if angle_between(other.pose, first.pose) > DISTINCT:
                 if other.cost < first.cost:
                     first, other = other, first
-                second = other.cost
-        return _Fit(first.pose, first.cost, first.information, second)
+                return replace(first, second=other)
+        return first
 
     def descended(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
         """Gauss-Newton with damping."""
@@ -223,15 +269,15 @@ class _Problem:
                     break
             else:
                 damping = max(10 * damping, 1e-2)
-        return _Fit(pose, cost, information, np.inf)
+        return _Fit(pose, cost, information)
 
     def system(
         self, pose: Array, known: tuple[bool, float | None] | None
     ) -> tuple[float, Array, Array]:
         """Sum of squares in standard deviations, its gradient / 2 and Gauss-Newton's matrix."""
-        parts = [_residual(one, pose) for one in self.corners]
-        residual = np.concatenate([part[0] for part in parts])
-        rates = np.concatenate([part[1] for part in parts])
+        parts = [one.residual(pose) for one in self.seen]
+        residual = np.concatenate([part[0].ravel() for part in parts])
+        rates = np.concatenate([part[1].reshape(-1, 6) for part in parts])
         if known is not None:
             upright, height = known
             if upright:
@@ -239,7 +285,11 @@ class _Problem:
                 # of the axis' x and y with a small rotation: w x axis
                 turn[0, 3:], turn[1, 3:] = (0, axis[2], -axis[1]), (-axis[2], 0, axis[0])
                 # further than a quarter turn away it is no nearer
-                away = axis[:2] if axis[2] > 0 else axis[:2] / max(np.linalg.norm(axis[:2]), 1e-3)
+                away = (
+                    axis[:2]
+                    if axis[2] > 0
+                    else axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3)
+                )
                 residual = np.append(residual, away / UPRIGHT_STD)
                 rates = np.concatenate((rates, turn / UPRIGHT_STD))
             if height is not None:
@@ -249,62 +299,41 @@ class _Problem:
 
     def judged(self, fit: _Fit, misfit: float) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
-        covariance = np.linalg.pinv(fit.information, hermitian=True) * max(misfit, 1)
+        inverse_information = np.linalg.pinv(fit.information, hermitian=True)
+        covariance = np.asarray(inverse_information * max(misfit, 1), dtype=float)
         position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
                           (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
-        reason = ""
+        reason, alternative = "", None
         if misfit > MOST_MISFIT**2:
             reason = "the corners of its tag fit no pose"
-        elif fit.second < LEAST_RATIO * max(fit.cost, self.numbers - 6):
-            reason = "two poses explain what is seen"
+        elif fit.second and fit.second.cost < LEAST_RATIO * max(fit.cost, self.freedom):
+            reason, alternative = "two poses explain what is seen", fit.second.pose
         elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
             reason = (
                 f"it is uncertain by {1e3 * position:.0f} mm and {np.degrees(turn):.0f} deg: "
                 "its tags are too small in the picture"
             )
-        squares = [_pixels(one, fit.pose) - one.seen for one in self.corners]
-        residual = float(np.sqrt(np.mean(np.square(squares).sum(-1))))
-        return PoseEstimate(fit.pose, covariance, residual, not reason, reason, self.tags)
+        errors = np.concatenate([one.errors(fit.pose) for one in self.seen])
+        residual = float(np.sqrt(np.mean(np.square(errors).sum(-1))))
+        return PoseEstimate(
+            fit.pose, covariance, residual, not reason, reason, self.tags, alternative
+        )
 
 
-def _hypotheses(one: _Corners) -> list[Array]:
-    """Both poses of the target by which a flat tag can be explained."""
-    points = one.points
-    size = float(np.linalg.norm(points[1] - points[0]))
-    x, y = (points[1] - points[0]) / size, (points[0] - points[3]) / size
-    target_from_tag = rigid(np.stack((x, y, np.cross(x, y)), axis=1), points.mean(0))
-    square = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * size / 2
-    camera = one.view.camera
-    _, turns, places, _ = cv2.solvePnPGeneric(
-        square, one.seen.reshape(4, 1, 2), camera.matrix, np.array(camera.distortion),
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )  # fmt: skip
-    tag_from_target = inverse(target_from_tag)
-    found = []
-    for turn, place in zip(turns, places, strict=True):
-        if np.isfinite(turn).all() and np.isfinite(place).all():
-            found.append(one.view.base_from_camera @ rigid(turn, place) @ tag_from_target)
+def _hypotheses(seen: _Seen) -> list[Array]:
+    """The two poses of the target by which each of its flat tags can be explained."""
+    camera, found = seen.view.camera, list[Array]()
+    for points, pixels in zip(seen.points, seen.pixels, strict=True):
+        size = float(np.linalg.norm(points[1] - points[0]))
+        x, y = (points[1] - points[0]) / size, (points[0] - points[3]) / size
+        target_from_tag = rigid(np.stack((x, y, np.cross(x, y)), axis=1), points.mean(0))
+        square = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * size / 2
+        _, turns, places, _ = cv2.solvePnPGeneric(
+            square, pixels.reshape(4, 1, 2), camera.matrix, np.array(camera.distortion),
+            flags=cv2.SOLVEPNP_IPPE_SQUARE,
+        )  # fmt: skip
+        base_from_camera, tag_from_target = seen.view.base_from_camera, inverse(target_from_tag)
+        for turn, place in zip(turns, places, strict=True):
+            if np.isfinite(turn).all() and np.isfinite(place).all():
+                found.append(base_from_camera @ rigid(turn, place) @ tag_from_target)
     return found
-
-
-def _pixels(one: _Corners, pose: Array) -> Array:
-    """Where the corners of a tag are expected."""
-    camera_from_target = inverse(one.view.base_from_camera) @ pose
-    return one.view.camera.project(transformed(camera_from_target, one.points))
-
-
-def _residual(one: _Corners, pose: Array) -> tuple[Array, Array]:
-    """Expected less seen corners (8,) in standard deviations, and how the pose moves them."""
-    camera_from_base = inverse(one.view.base_from_camera)
-    turned = one.points @ pose[:3, :3].T
-    points = transformed(camera_from_base, turned + pose[:3, 3])
-    if (points[:, 2] < 1e-3).any():  # behind the camera
-        return np.full(8, 1e3), np.zeros((8, 6))
-    pixels, rates = one.view.camera.projected(points)
-    rates = rates @ camera_from_base[:3, :3]
-    x, y, z = turned.T
-    zero = np.zeros(4)
-    # d (w x p) / d w = -[p]x
-    cross = np.stack((zero, z, -y, -z, zero, x, y, -x, zero), axis=-1).reshape(4, 3, 3)
-    moved = np.concatenate((rates, rates @ cross), axis=-1).reshape(8, 6)
-    return one.whiten @ (pixels - one.seen).ravel(), one.whiten @ moved

@@ -23,14 +23,16 @@ __all__ = ["Detections", "TagDetector", "grey"]
 #: Pixels of the pattern on a side of a module, and white modules around its square.
 TEXTURE, QUIET = 8, 1
 #: What is compared reaches this far beyond the black square [modules].
-MARGIN = 0.6
-#: Blur of a camera, standard deviation [pixels].
-BLUR = 0.7
+MARGIN = 0.35
+#: Blur of a picture: the variance that a fit begins with, the least and the most [pixels^2].
+BLUR, LEAST_BLUR, MOST_BLUR = 0.5, 0.1, 6.0
 #: Steps of Gauss-Newton, and a step of all corners that ends it [pixels].
-STEPS, SMALL_STEP = 8, 0.003
+STEPS, SMALL_STEP = 8, 0.02
 #: A fit is refused that moves a corner further than this [share of an edge], or explains less
 #: than this share of the variance of the grey values.
 FARTHEST, LEAST_EXPLAINED = 0.2, 0.7
+#: A tag of fewer pixels is not fitted: there are 17 unknowns.
+LEAST_PIXELS = 60
 #: What noise does not explain: the lens, the print, the light [pixels].
 MODEL_ERROR = 0.05
 
@@ -116,7 +118,7 @@ class TagDetector:
             if min(part.shape, default=0) < self._modules:
                 continue
             for number, corners in self._rough(part):
-                corners = corners + (left, top)
+                corners += np.array([left, top])
                 if number in rough and np.abs(rough[number] - corners).max() > 2:
                     twice.add(number)
                 rough.setdefault(number, corners)
@@ -142,10 +144,11 @@ class TagDetector:
     def _pattern(self, number: int) -> NDArray[np.float32]:
         """The tag and white around it, 0 to 1."""
         if number not in self._patterns:
-            side, edge = self._modules * TEXTURE, [QUIET * TEXTURE] * 4
-            drawn = cv2.aruco.generateImageMarker(self._dictionary, number, side)
-            white = cv2.copyMakeBorder(drawn, *edge, cv2.BORDER_CONSTANT, value=255)
-            self._patterns[number] = white.astype(np.float32) / 255
+            drawn = cv2.aruco.generateImageMarker(
+                self._dictionary, number, self._modules * TEXTURE
+            )
+            white = np.pad(drawn, QUIET * TEXTURE, constant_values=255)
+            self._patterns[number] = np.asarray(white / 255, dtype=np.float32)
         return self._patterns[number]
 
     def _refined(
@@ -182,12 +185,13 @@ class _Fit:
         self.centre = np.array([width - 1, height - 1]) / 2
         self.scale = max(width, height) / 2
         v, u = np.mgrid[:height, :width]
+        self.blur = BLUR * np.eye(2)
         self.x, self.y = (u - self.centre[0]) / self.scale, (v - self.centre[1]) / self.scale
 
     def predicted(self, corners: Array) -> NDArray[np.float32]:
         """The pattern as it is seen with its corners there."""
         height, width = self.patch.shape
-        fine = 3 if max(height, width) < 60 else 2 if max(height, width) < 200 else 1
+        fine = 3 if max(height, width) < 64 else 2 if max(height, width) < 200 else 1
         target = ((corners + 0.5) * fine - 0.5).astype(np.float32)
         homography = cv2.getPerspectiveTransform(self.square, target)
         seen = cv2.warpPerspective(
@@ -196,43 +200,48 @@ class _Fit:
         )  # fmt: skip
         if fine > 1:
             seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-        return np.asarray(cv2.GaussianBlur(seen, (0, 0), BLUR))
+        return np.asarray(cv2.filter2D(seen, -1, _gaussian(self.blur)))
 
     def run(self, corners: Array) -> tuple[Array, Array] | None:
-        """Gauss-Newton on a projective motion of the corners and on the light."""
-        x, y, one = self.x, self.y, np.ones_like(self.x)
+        """Gauss-Newton on a projective motion of the corners, on the blur and on the light."""
+        middle, mask = corners.mean(0), np.zeros(self.patch.shape, np.uint8)
+        outline = np.round(middle + self.outer * (corners - middle)).astype(np.int32)
+        cv2.fillConvexPoly(mask, outline, 1)
+        inside = mask > 0
+        values, u, v = self.patch[inside], self.x[inside], self.y[inside]
+        if len(values) < LEAST_PIXELS:
+            return None
         for _ in range(STEPS):
             seen = self.predicted(corners)
-            middle = corners.mean(0)
-            mask = np.zeros(self.patch.shape, np.uint8)
-            outline = np.round(middle + self.outer * (corners - middle)).astype(np.int32)
-            cv2.fillConvexPoly(mask, outline, 1)
-            inside = mask > 0
-            if inside.sum() < 30:
-                return None
-            gx = cv2.Sobel(seen, cv2.CV_32F, 1, 0, scale=1 / 8)[inside]
-            gy = cv2.Sobel(seen, cv2.CV_32F, 0, 1, scale=1 / 8)[inside]
-            m, u, v, o = seen[inside], x[inside], y[inside], one[inside]
-            light = np.stack((m, m * u, m * v, o, u, v), axis=1)
-            values = self.patch[inside]
-            shades, *_ = np.linalg.lstsq(light, values, rcond=None)
+            # first and second derivatives along x and y
+            orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+            gx, gy, xx, xy, yy = (
+                cv2.Sobel(seen, cv2.CV_32F, *order, scale=2.0 ** (sum(order) - 4))[inside]
+                for order in orders
+            )
+            m = seen[inside]
+            light = np.stack((m, m * u, m * v, np.ones_like(m), u, v))
+            shades = np.linalg.solve(light @ light.T, light @ values)
             contrast = shades[0] + shades[1] * u + shades[2] * v
-            gx, gy = -gx * contrast * self.scale, -gy * contrast * self.scale
-            moves = np.stack(
-                (gx * u, gx * v, gx, gy * u, gy * v, gy, -(gx * u + gy * v) * u,
-                 -(gx * u + gy * v) * v), axis=1,
-            )  # fmt: skip
-            system = np.concatenate((moves, light), axis=1)
-            residual = values - light @ shades
-            step, *_ = np.linalg.lstsq(system, residual, rcond=None)
+            gx, gy = -self.scale * gx * contrast, -self.scale * gy * contrast
+            along = -(gx * u + gy * v)
+            # a blur's covariance changes a picture by half its second derivatives
+            bends = xx * contrast / 2, xy * contrast, yy * contrast / 2
+            system = np.stack(
+                (gx * u, gx * v, gx, gy * u, gy * v, gy, along * u, along * v, *bends, *light)
+            )
+            normal, residual = system @ system.T, values - shades @ light
+            normal[np.diag_indices_from(normal)] *= 1 + 1e-9
+            step = np.linalg.solve(normal, system @ residual)
             corners, moved = self._moved(corners, step[:8])
+            self._blurred(step[8:11])
             if moved < SMALL_STEP:
                 break
-        left = residual - system @ step
-        noise = float(left @ left) / max(len(left) - system.shape[1], 1)
+        left = residual - step @ system
+        noise = float(left @ left) / max(len(left) - len(system), 1)
         if contrast.min() <= 0 or noise > (1 - LEAST_EXPLAINED) * float(values.var()):
             return None
-        covariance = np.linalg.pinv(system.T @ system)[:8, :8] * noise
+        covariance = np.linalg.pinv(normal, hermitian=True)[:8, :8] * noise
         rates = self._rates(corners)
         error = MODEL_ERROR**2 * np.eye(8)
         return corners, rates @ covariance @ rates.T + error
@@ -244,6 +253,12 @@ class _Fit:
         new = points[:, :2] / points[:, 2:] * self.scale + self.centre
         return new, float(np.abs(new - corners).max())
 
+    def _blurred(self, step: Array) -> None:
+        """Change the blur, within what a picture may have."""
+        new = self.blur + step[[0, 1, 1, 2]].reshape(2, 2)
+        values, axes = np.linalg.eigh(new)
+        self.blur = axes * np.clip(values, LEAST_BLUR, MOST_BLUR) @ axes.T
+
     def _rates(self, corners: Array) -> Array:
         """How corners move with the motion (8, 8)."""
         (u, v), zero, one = ((corners - self.centre) / self.scale).T, np.zeros(4), np.ones(4)
@@ -251,3 +266,13 @@ class _Fit:
         rows[:, 0] = np.stack((u, v, one, zero, zero, zero, -u * u, -u * v), axis=1)
         rows[:, 1] = np.stack((zero, zero, zero, u, v, one, -u * v, -v * v), axis=1)
         return self.scale * rows.reshape(8, 8)
+
+
+def _gaussian(covariance: Array) -> Array:
+    """A kernel of that covariance [pixels^2]."""
+    reach = int(np.ceil(3 * np.sqrt(float(np.diag(covariance).max()))))
+    line = np.arange(-reach, reach + 1)
+    (a, b), (_, c) = np.linalg.inv(covariance)
+    across = b * line * line[:, None]
+    kernel = np.exp(-0.5 * (a * line**2 + c * line[:, None] ** 2) - across)
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)

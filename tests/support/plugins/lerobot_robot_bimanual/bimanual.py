@@ -1,5 +1,6 @@
 import json
 
+import numpy as np
 from lerobot.robots import Robot
 
 from .config_bimanual import BimanualConfig
@@ -21,10 +22,12 @@ class Bimanual(Robot):
         super().__init__(config)
         self.config, self._connected, self._actions = config, False, []
         self._observed = json.loads(config.start.read_text())
+        self._seen = {} if config.picture is None else {"front": np.load(config.picture)}
 
     @property
     def observation_features(self):
-        return dict.fromkeys(self._observed, float)
+        cameras = {name: picture.shape for name, picture in self._seen.items()}
+        return dict.fromkeys(self._observed, float) | cameras
 
     @property
     def action_features(self):
@@ -48,7 +51,7 @@ class Bimanual(Robot):
         pass
 
     def get_observation(self):
-        return dict(self._observed)
+        return self._observed | self._seen
 
     def send_action(self, action):
         self._actions.append(dict(action))

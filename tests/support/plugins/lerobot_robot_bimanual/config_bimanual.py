@@ -9,9 +9,11 @@ from lerobot.robots import RobotConfig
 class BimanualConfig(RobotConfig):
     """``start`` holds what is observed by name, ``log`` will hold the actions.
 
-    After ``stuck_after`` actions it stands.
+    After ``stuck_after`` actions it stands. Its camera ``front`` always sees the same
+    ``picture``, a file of numpy's.
     """
 
     start: Path
     log: Path
     stuck_after: int = 10**6
+    picture: Path | None = None

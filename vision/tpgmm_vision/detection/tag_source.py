@@ -1,0 +1,285 @@
+"""Poses of the objects of a cell from the tags on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_vision.cell import Cell, CellCamera
+from tpgmm_vision.detection.estimation import PoseEstimate, View, estimate_pose
+from tpgmm_vision.detection.tags import Detections, TagDetector
+from tpgmm_vision.detection.tracker import Tracker
+from tpgmm_vision.poses import (
+    Array,
+    angle_between,
+    inverse,
+    pose_matrix,
+    pose_vector,
+    transformed,
+)
+from tpgmm_vision.sources import ObservedPose
+from tpgmm_vision.targets import Target
+
+if TYPE_CHECKING:
+    from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["TagSource", "camera_poses"]
+
+#: A camera was moved if a check is seen this far from where it is [m], so many times in a row.
+MOVED, CONFIRMED = 0.005, 3
+#: Around a target's last place its tags are looked for this far, in sizes of it in the picture.
+REACH = 0.6
+#: How much pictures are magnified before tags are looked for.
+MAGNIFY = 2
+
+
+class TagSource:
+    """Finds the objects of a cell by their tags: a :class:`~tpgmm_vision.sources.PoseSource`.
+
+    Parameters
+    ----------
+    cell : Cell
+        All its cameras have poses.
+    robot : Kinematics, optional
+        Needed where a camera is on a link.
+
+    Attributes
+    ----------
+    problem : str
+        Says which camera was moved, by how far; empty if none was.
+    estimates : dict of str to PoseEstimate
+        Of the objects that the last pictures show.
+    detections : dict of str to dict of str to Detections
+        Tags in the last pictures, by camera and family.
+
+    Raises
+    ------
+    DataError
+        If the cell is not calibrated, has no objects, or its cameras are on links of a robot
+        that is not given or has other joints.
+    """
+
+    def __init__(self, cell: Cell, robot: Kinematics | None = None) -> None:
+        self._cameras = cell.placed()
+        if not cell.objects:
+            raise DataError('the cell has no objects: add them to its file under "objects"')
+        _check_robot(cell, robot)
+        self._cell, self._robot = cell, robot
+        # in the frame of the object, so that its axis and its height are those of the pose
+        self._targets = {
+            name: Target(
+                {n: transformed(inverse(one.pose), c) for n, c in one.target.corners.items()},
+                one.target.family,
+            )
+            for name, one in cell.objects.items()
+        }
+        families = {one.target.family for one in cell.objects.values()}
+        families |= {one.target.family for one in cell.checks.values()}
+        self._detectors = {family: TagDetector(family, MAGNIFY) for family in families}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was seen: another episode begins."""
+        self.problem = ""
+        self.estimates: dict[str, PoseEstimate] = {}
+        self.detections: dict[str, dict[str, Detections]] = {}
+        self._trackers = {name: Tracker() for name in self._targets}
+        self._boxes: dict[str, list[tuple[int, int, int, int]] | None] = {}
+        self._moved = dict.fromkeys(self._cameras, 0)
+        self._problems: dict[str, str] = {}
+
+    def poses(
+        self,
+        images: Mapping[str, NDArray[np.uint8]],
+        joints: Mapping[str, float],
+        time: float,
+    ) -> dict[str, ObservedPose]:
+        """The poses of all objects now.
+
+        Parameters
+        ----------
+        images : mapping of str to ndarray of shape (height, width, 3)
+            RGB pictures by the key of the camera, of all cameras of the cell.
+        joints : mapping of str to float
+            Measured, by the names of the robot's description [rad].
+        time : float
+            When they were taken [s].
+
+        Raises
+        ------
+        DataError, UnknownNameError
+            If a picture or a joint is missing, or of another size.
+        """
+        places = camera_poses(self._cell, self._robot, joints)
+        for name, one in self._cameras.items():
+            if one.key not in images:
+                raise UnknownNameError("picture", one.key, "the observation", images)
+            one.camera.check(images[one.key], name)
+            boxes = self._boxes.get(name)
+            self.detections[name] = {
+                family: detector(images[one.key], boxes)
+                for family, detector in self._detectors.items()
+            }
+        self._check(places)
+        found = {name: self._object(name, places, time) for name in self._targets}
+        self._boxes = {
+            name: self._around(name, one, places) for name, one in self._cameras.items()
+        }
+        return found
+
+    def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
+        """What all cameras see of a target that are where they were."""
+        views = []
+        for name, one in self._cameras.items():
+            if self._moved[name]:
+                continue
+            seen = self.detections[name][target.family]
+            views.append(View(one.camera, places[name], seen.corners, seen.covariances))
+        return views
+
+    def _object(self, name: str, places: Mapping[str, Array], time: float) -> ObservedPose:
+        """Measure one object."""
+        target, known = self._targets[name], self._cell.objects[name]
+        twice = sorted(
+            number
+            for seen in self.detections.values()
+            for number in seen[target.family].twice & target.corners.keys()
+        )
+        reason, found = "no tag of it is seen", None
+        if twice:
+            reason = f"tag {twice[0]} is seen twice"
+        else:
+            found = estimate_pose(
+                self._views(target, places), target, upright=known.upright, height=known.height
+            )
+        self.estimates.pop(name, None)
+        if found is not None:
+            self.estimates[name] = found
+        track = self._trackers[name].update(found, time, reason)
+        if track is None:
+            why = reason if found is None else found.reason
+            return ObservedPose(np.full(7, np.nan), np.full((6, 6), np.nan), False, why)
+        valid, why = track.valid and not self.problem, self.problem or track.reason
+        return ObservedPose(pose_vector(track.pose), track.covariance, valid, why)
+
+    def _check(self, places: Mapping[str, Array]) -> None:
+        """Look whether tags that stand still are where they were."""
+        for name, one in self._cameras.items():
+            if (error := self._check_error(name, one, places[name])) is None:
+                continue
+            self._moved[name] = self._moved[name] + 1 if error > MOVED else 0
+            if not self._moved[name]:
+                self._problems.pop(name, None)
+            elif self._moved[name] >= CONFIRMED and name not in self._problems:
+                self._problems[name] = self._said(name, one, places[name])
+        self.problem = "; ".join(self._problems.values())
+
+    def _check_error(self, name: str, one: CellCamera, place: Array) -> float | None:
+        """How far from where they are checks are seen across the line of sight [m]."""
+        errors = []
+        for known in self._cell.checks.values():
+            seen = self.detections[name][known.target.family].corners
+            for number in seen.keys() & known.target.corners.keys():
+                points = transformed(inverse(place) @ known.pose, known.target.corners[number])
+                away = np.linalg.norm(one.camera.project(points) - seen[number], axis=1)
+                depth = float(points[:, 2].mean())
+                errors.append(float(np.median(away)) * depth / min(one.camera.focal_length))
+        return max(errors, default=None)
+
+    def _said(self, name: str, one: CellCamera, place: Array) -> str:
+        """What is said of a camera that was moved, as far as it is seen now."""
+        by = ""
+        for known in self._cell.checks.values():
+            seen = self.detections[name][known.target.family]
+            view = View(one.camera, np.eye(4), seen.corners, seen.covariances)
+            if found := estimate_pose([view], known.target):
+                now = known.pose @ inverse(found.pose)
+                far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
+                by = f" by {1e3 * far:.0f} mm and {np.degrees(turn):.1f} deg"
+        return (
+            f"camera {name!r} was moved{by}, or a tag of the checks {list(self._cell.checks)} "
+            "was; put it back, or run tpgmm calibrate cell again"
+        )
+
+    def _around(
+        self, name: str, one: CellCamera, places: Mapping[str, Array]
+    ) -> list[tuple[int, int, int, int]] | None:
+        """Where tags are looked for next; everywhere (None) unless all objects are seen."""
+        seen = [name for name, found in self.estimates.items() if found.valid]
+        if len(seen) < len(self._targets):
+            return None
+        boxes, camera_from_base = [], inverse(places[name])
+        found = [(self._targets[n], e.pose) for n, e in self.estimates.items()]
+        found += [(check.target, check.pose) for check in self._cell.checks.values()]
+        for target, pose in found:
+            corners = np.concatenate(list(target.corners.values()))
+            points = transformed(camera_from_base @ pose, corners)
+            if (points[:, 2] < 0.01).any():
+                continue
+            pixels = one.camera.project(points)
+            low, high = pixels.min(0), pixels.max(0)
+            reach = REACH * float((high - low).max()) + 8
+            boxes.append(
+                tuple(np.round((*(low - reach), *(high + reach))).astype(int).tolist())
+            )
+        return boxes
+
+
+def _check_robot(cell: Cell, robot: Kinematics | None) -> None:
+    """Refuse a cell of another robot."""
+    if robot is None:
+        if cell.links:
+            raise DataError(
+                f"cameras of the cell are on links {list(cell.links)}: give the robot"
+            )
+        return
+    for link in cell.links:
+        if link not in robot.links:
+            raise UnknownNameError("link", link, "the robot", robot.links)
+    missing = [name for name in cell.joints if name not in robot.joint_names]
+    if missing:
+        raise DataError(
+            f"the cell was calibrated with another robot: it has joints {missing}, this one "
+            f"has {list(robot.joint_names)}"
+        )
+
+
+def camera_poses(
+    cell: Cell, robot: Kinematics | None, joints: Mapping[str, float]
+) -> dict[str, Array]:
+    """``base_from_camera`` (4, 4) of all cameras of a cell.
+
+    Parameters
+    ----------
+    cell : Cell
+    robot : Kinematics, optional
+        Needed where a camera is on a link.
+    joints : mapping of str to float
+        Of the robot's description, offsets included [rad].
+
+    Raises
+    ------
+    UnknownNameError
+        If a joint is missing.
+    """
+    links = {}
+    if cell.links:
+        assert robot is not None
+        for name in robot.joint_names:
+            if name not in joints:
+                raise UnknownNameError("joint", name, "the measured joints", joints)
+        values = [[joints[name] for name in robot.joint_names]]
+        state = robot.state(torch.tensor(values).to(robot.lower))
+        for link in cell.links:
+            pose = torch.cat((state.position(link), state.orientation(link)), dim=-1)
+            links[link] = pose_matrix(pose[0].double().cpu().numpy())
+    placed = {}
+    for name, one in cell.placed().items():
+        assert one.pose is not None
+        placed[name] = one.pose if one.link is None else links[one.link] @ one.pose
+    return placed

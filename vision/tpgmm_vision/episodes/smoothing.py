@@ -1,0 +1,205 @@
+"""The poses of an object over a whole episode, smoothed by looking both ways in time.
+
+Where the object is at rest, the robust mean of all its frames counts; where it moves, what was
+measured. Gaps are filled where it is known what the object did: it stood still before and
+after, a hand carried it, or the gap is short. Elsewhere the last pose is repeated, and said to
+be unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation, Slerp
+
+from tpgmm_torch.exceptions import DataError
+from tpgmm_vision.poses import Array, inverse, mean_pose
+
+__all__ = ["Track"]
+
+#: Poses are as far apart as three points on their axes are in the mean, which are so far from
+#: the origin: an object is about as large [m].
+LEVER = 0.05
+#: What moves by less, or by less than so many times the noise of a frame, is at rest [m].
+REST_DISTANCE, REST_NOISE = 0.003, 3.0
+#: A rest takes this long [s], and has so many frames; so many frames elsewhere end it.
+REST_TIME, REST_FRAMES, ELSEWHERE = 0.3, 5, 3
+#: Of a hand that carries an object so many frames must tell, over a way of so many times what
+#: counts as rest; an object is put down to twice that.
+CARRIED_FRAMES, CARRIED_WAY, PUT = 3, 3.0, 2.0
+#: A gap in a motion that is interpolated, as long as a hand's motion is nearly straight [s].
+SHORT_GAP = 0.2
+#: By when an object must have been seen at rest: a robot hardly reaches it earlier [s].
+LATE = 0.5
+
+
+class Track:
+    """Where an object was in an episode.
+
+    Parameters
+    ----------
+    time : ndarray of shape (T,)
+        Of the rows [s].
+
+    Attributes
+    ----------
+    poses : ndarray of shape (T, 4, 4)
+        In the base frame.
+    seen, known : ndarray of bool, shape (T,)
+        Whether it was measured in a row; whether it was measured or inferred.
+    residuals : ndarray of shape (T,)
+        Of the corners, where it was seen [pixels].
+    reasons : list of str
+        Why it was not seen in a row.
+    spread : float
+        How far measured positions are from the means of rests, root mean square [m].
+    """
+
+    def __init__(self, time: Array) -> None:
+        self.time, rows = time, len(time)
+        self.poses, self.residuals = np.tile(np.eye(4), (rows, 1, 1)), np.zeros(rows)
+        self.seen, self.known = np.zeros((2, rows), dtype=bool)
+        self.reasons = [""] * rows
+        self._rest, self._tolerance, self.spread = np.full(rows, -1), REST_DISTANCE, 0.0
+
+    def smooth(self, hands: Mapping[str, Array]) -> None:
+        """Smooth the poses that were seen, and fill gaps.
+
+        Parameters
+        ----------
+        hands : mapping of str to ndarray of shape (T, 4, 4)
+            Poses of links that may carry it.
+
+        Raises
+        ------
+        DataError
+            If it was never seen, or first seen late.
+        """
+        index = np.flatnonzero(self.seen)
+        if not len(index):
+            raise DataError(f"it was never seen: {self.reasons[-1]}")
+        points, self.known = _points(self.poses[index]), self.seen.copy()
+        jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
+        noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
+        self._tolerance = max(REST_DISTANCE, REST_NOISE * noise)
+        squares = [np.zeros(0)]
+        for number, inside in enumerate(_rests(self.time[index], points, self._tolerance)):
+            rows = index[inside]
+            mean, agree = mean_pose(list(self.poses[rows]))
+            squares.append(np.square(self.poses[rows, :3, 3] - mean[:3, 3]).sum(axis=1))
+            stretch = slice(rows[agree][0], rows[agree][-1] + 1)
+            self._rest[stretch] = number
+            self._fill(stretch, mean)
+        self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares[1:] else 0.0
+        known = np.flatnonzero(self.known)
+        if known[0] > 0:
+            if self.time[known[0]] > LATE or self._rest[known[0]] < 0:
+                raise DataError(
+                    f"it was first seen {self.time[known[0]]:.2f} s after the start, "
+                    f"{'standing' if self._rest[known[0]] >= 0 else 'moving'}"
+                )
+            self._fill(slice(0, known[0]), self.poses[known[0]])
+        for a, b in pairwise(known.tolist()):
+            if b > a + 1:
+                self._bridge(a, b, hands)
+        self._finish(int(known[-1]), hands)
+
+    def _fill(self, rows: slice, poses: Array) -> None:
+        self.poses[rows], self.known[rows] = poses, True
+
+    def _bridge(self, a: int, b: int, hands: Mapping[str, Array]) -> None:
+        """Fill the gap between two known rows."""
+        ends, gap = self.poses[[a, b]], slice(a + 1, b)
+        apart = np.linalg.norm(np.diff(_points(ends), axis=0))
+        if min(self._rest[[a, b]]) >= 0 and apart < self._tolerance:
+            self._fill(gap, ends[0])
+        elif self.time[b] - self.time[a] <= SHORT_GAP:
+            self._fill(gap, _between(self.time[a : b + 1], ends))
+        else:
+            self.poses[gap] = ends[0]
+            found = [self._carried(hand, a, b) for hand in hands.values()]
+            off, taken, put, poses = min(
+                found, key=lambda one: one[0], default=(np.inf, a, b, ends)
+            )
+            if off <= PUT * self._tolerance:
+                self._fill(gap, poses[gap])
+                self._fill(slice(a + 1, taken + 1), ends[0])
+                self._fill(slice(put, b), ends[1])
+
+    def _carried(self, hand: Array, a: int, b: int) -> tuple[float, int, int, Array]:
+        """How well a hand explains a gap, from and to when it carried, and the poses then."""
+        taken, before = self._grasps(hand, a, np.arange(a, b), -1)
+        put, after = self._grasps(hand, b, np.arange(a + 1, b + 1), 1)
+        away = cdist(_points(before), _points(after))
+        away[(taken[:, None] >= put) | np.isnan(away)] = np.inf
+        i, j = np.unravel_index(away.argmin(), away.shape)
+        return float(away[i, j]), int(taken[i]), int(put[j]), hand @ before[i]
+
+    def _grasps(self, hand: Array, at: int, gap: Any, way: int) -> tuple[Any, Array]:
+        """Rows in which a hand may have taken or put down the object, and its poses in it."""
+        if self._rest[at] >= 0:
+            return gap, inverse(hand[gap]) @ self.poses[at]
+        return np.array([at]), self._held(hand, at, way)[1][None]
+
+    def _held(self, hand: Array, at: int, way: int) -> tuple[int, Array]:
+        """In how many rows up to (-1) or from (1) one a hand carries an object; its pose, or NaN."""
+        rows = np.flatnonzero(self.known)
+        rows = rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+        inside = inverse(hand[rows]) @ self.poses[rows]
+        points = _points(inside)
+        away = np.linalg.norm(points - np.median(points[:CARRIED_FRAMES], axis=0), axis=1)
+        count = int(np.append(away > self._tolerance, True).argmax())
+        moved = np.linalg.norm(_points(self.poses[rows]) - _points(self.poses[at]), axis=1)
+        if count < CARRIED_FRAMES or moved[:count].max() < CARRIED_WAY * self._tolerance:
+            return 0, np.full((4, 4), np.nan)
+        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
+
+    def _finish(self, last: int, hands: Mapping[str, Array]) -> None:
+        """Fill what follows the last known row."""
+        rows = slice(last + 1, len(self.time))
+        self.poses[rows] = self.poses[last]
+        found = [(*self._held(hand, last, -1), hand) for hand in hands.values()]
+        if self._rest[last] < 0 and found:
+            count, grasp, hand = max(found, key=lambda one: one[0])
+            if count:
+                self._fill(rows, hand[rows] @ grasp)
+
+
+def _points(poses: Array) -> Array:
+    """Poses (..., 4, 4) as points (..., 9), whose distances are those of poses."""
+    points = poses[..., :3, 3:] + LEVER * poses[..., :3, :3]
+    return np.asarray(points.reshape(*poses.shape[:-2], 9) / np.sqrt(3))
+
+
+def _rests(time: Array, points: Array, tolerance: float) -> list[list[int]]:
+    """Frames of which each rest consists, among those that were seen."""
+    found, start = list[list[int]](), 0
+    while start < len(points):
+        inside, at = [start], start + 1
+        while at < len(points) and at - inside[-1] <= ELSEWHERE:
+            middle = np.median(points[inside[:: 1 + len(inside) // 64]], axis=0)
+            if np.linalg.norm(points[at] - middle) <= tolerance:
+                inside.append(at)
+            at += 1
+        third = max(len(inside) // 3, 1)
+        drift = np.median(points[inside[:third]], 0) - np.median(points[inside[-third:]], 0)
+        lasts = time[inside[-1]] - time[inside[0]] >= REST_TIME and len(inside) >= REST_FRAMES
+        if lasts and np.linalg.norm(drift) <= tolerance / 2:
+            found.append(inside)
+            start = inside[-1] + 1
+        else:
+            start += 1 + len(inside) // 8
+    return found
+
+
+def _between(time: Array, ends: Array) -> Array:
+    """Poses (T - 2, 4, 4) at the times (T,) between two poses."""
+    share = ((time[1:-1] - time[0]) / (time[-1] - time[0]))[:, None, None]
+    found = (1 - share) * ends[0] + share * ends[1]
+    turns = Slerp(time[[0, -1]], Rotation.from_matrix(ends[:, :3, :3]))
+    found[:, :3, :3] = turns(time[1:-1]).as_matrix()
+    return np.asarray(found)

@@ -1,0 +1,184 @@
+"""Pictures of the episodes of a LeRobot data set: videos (AV1, H.264, ...) and images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.files import chunked_files
+from tpgmm_datasets.lerobot.layout import Episode, Layout, episode_file
+from tpgmm_datasets.lerobot.parquet import open_parquet, read_columns
+from tpgmm_vision.poses import Array
+
+__all__ = ["EpisodePictures", "Picture"]
+
+Picture = NDArray[np.uint8]
+#: How far a picture of a video may be from the time of its row [periods]: below a half, so that
+#: no other picture is meant.
+OFF_ROW = 0.25
+#: Where an episode is in the videos: numbers, and from when to when [s].
+PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+#: Rows with images that are read at a time: what bounds the memory.
+IMAGE_ROWS = 16
+
+
+class EpisodePictures:
+    """Read the pictures of cameras, episode by episode, one row at a time.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the data set, in v2.1 or v3.0.
+    keys : sequence of str
+        Features of the cameras.
+
+    Raises
+    ------
+    DatasetError
+        If there is no such camera, or the metadata do not say where its videos are.
+    """
+
+    def __init__(self, layout: Layout, keys: Sequence[str]) -> None:
+        self.layout, self.keys = layout, tuple(keys)
+        there = [key for key, feature in layout.features.items() if feature.is_camera]
+        if missing := [key for key in keys if key not in there]:
+            raise DatasetError(
+                f"the set has no pictures {missing}; its cameras are {there}. The cell says "
+                "which camera is meant, in 'key'",
+                file="meta/info.json",
+            )
+        self.videos = [key for key in keys if layout.features[key].dtype == "video"]
+        self._places = dict[tuple[str, int], list[Any]]()
+        for path in chunked_files(layout.root / "meta" / "episodes"):  # of v3.0
+            for key in self.videos:
+                columns = [f"videos/{key}/{part}" for part in PLACE]
+                table = read_columns(path, layout.root, ["episode_index", *columns])
+                for index, *place in zip(*table.to_pydict().values(), strict=True):
+                    self._places[key, index] = place
+
+    def read(self, episode: Episode, time: Array) -> Iterator[dict[str, Picture]]:
+        """The pictures of each row of an episode, RGB of shape (height, width, 3), by key.
+
+        Parameters
+        ----------
+        episode : Episode
+        time : ndarray of shape (T,)
+            Of its rows, from its start [s].
+
+        Raises
+        ------
+        DatasetError
+            If a video or an image is missing or damaged, or a video does not fit the rows.
+        """
+        streams = [
+            self._video(key, episode, time)
+            if key in self.videos
+            else self._images(key, episode, len(time))
+            for key in self.keys
+        ]
+        for pictures in zip(*streams, strict=True):
+            yield dict(zip(self.keys, pictures, strict=True))
+
+    def _video(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
+        layout, period = self.layout, 1 / self.layout.fps
+        place: Any = None
+        start, stop = 0.0, len(time) / layout.fps
+        if layout.version == "v3.0":
+            *place, start, stop = self._places[key, episode.index]
+        file = episode_file(layout.info, "video_path", episode.index, place, video_key=key)
+        where: dict[str, Any] = {"file": file, "episode": episode.index, "column": key}
+        if abs(stop - start - len(time) * period) > OFF_ROW * period:
+            message = f"the episode takes {stop - start:.6g} s of the video, its rows "
+            raise _unlike(f"{message}{len(time)} x {period:.6g} s", where)
+        row, at = 0, start
+        for at, frame in _frames(layout.root / file, start, where):
+            if row == len(time):
+                raise _unlike(f"the video goes on behind its {row} rows", where)
+            off = (at - start - time[row]) / period
+            if off > OFF_ROW:
+                break
+            if off > -OFF_ROW:
+                yield frame.to_ndarray(format="rgb24")
+                row += 1
+                if row == len(time) and place:
+                    return  # others follow in the same file
+        if row < len(time):
+            message = (
+                f"no picture is at {start + time[row]:.4f} s of the video, where row {row} is"
+            )
+            raise _unlike(f"{message}; the last that was looked at is at {at:.4f} s", where)
+
+    def _images(self, key: str, episode: Episode, rows: int) -> Iterator[Picture]:
+        root, count = self.layout.root, 0
+        where: dict[str, Any] = {"file": episode.file, "episode": episode.index, "column": key}
+        columns = ["episode_index", key]
+        with open_parquet(root / episode.file, root, columns) as parquet:
+            inside = _row_groups(parquet, episode, self.layout)
+            for batch in parquet.iter_batches(IMAGE_ROWS, inside, columns=columns):
+                for index, stored in zip(*(batch[c].to_pylist() for c in columns), strict=True):
+                    if index == episode.index:
+                        yield _decoded(stored, root, {**where})
+                        count += 1
+        if count != rows:
+            raise _unlike(f"there are {count} images for {rows} rows", where)
+
+
+def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
+    remedy = "Was it cut, or recorded at another rate? Without its video it cannot be tracked"
+    return DatasetError(f"{problem}. {remedy}", check="metadata", **where)
+
+
+def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[float, Any]]:
+    """Time [s] and frame of a video, from the key frame before ``start`` on."""
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            # what is damaged is an error, not a guess of the decoder's
+            stream.codec_context.options = {"err_detect": "explode"}
+            base = stream.time_base or Fraction(1)
+            container.seek(max(round(start / base) - 1, 0), stream=stream)
+            for frame in container.decode(stream):
+                if frame.is_corrupt or frame.pts is None:
+                    raise ValueError(f"a damaged picture at {frame.time} s")
+                yield float(frame.pts * base), frame
+    except (av.error.FFmpegError, IndexError, ValueError) as error:
+        problem = (
+            "damaged, or of a kind that PyAV does not read" if path.is_file() else "missing"
+        )
+        message = f"the video is {problem} ({error})"
+        raise DatasetError(message, check="missing", **where) from error
+
+
+def _row_groups(parquet: Any, episode: Episode, layout: Layout) -> list[int]:
+    """The row groups of a data file that may hold rows of an episode."""
+    groups = range(parquet.metadata.num_row_groups)
+    if episode.start is None:
+        return list(groups)
+    same = [one.start or 0 for one in layout.episodes if one.file == episode.file]
+    first = episode.start - min(same)
+    ends = np.cumsum([0, *(parquet.metadata.row_group(g).num_rows for g in groups)])
+    last = first + episode.length
+    return [g for g, (a, b) in enumerate(pairwise(ends)) if a < last and b > first]
+
+
+def _decoded(stored: Any, root: Path, where: dict[str, Any]) -> Picture:
+    """A picture as LeRobot stores images: bytes of a file, or its path."""
+    content, path = (stored or {}).get("bytes"), (stored or {}).get("path")
+    if content is None and path and (root / path).resolve().is_relative_to(root.resolve()):
+        content = (root / path).read_bytes() if (root / path).is_file() else None
+    found = None
+    if content:
+        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if found is None:
+        message = f"an image is missing or damaged (path {path!r})"
+        raise DatasetError(message, check="missing", **where)
+    return np.ascontiguousarray(found[..., ::-1])
