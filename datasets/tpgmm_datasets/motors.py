@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.least_squares import levenberg_marquardt
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.units import Scale, Unit, as_scale
 from tpgmm_torch import quaternions
@@ -248,24 +249,8 @@ class _Problem:
         return position * self.position_std, turn * self.orientation_std if known else math.nan
 
     def _descend(self, signs: Tensor, offsets: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Levenberg-Marquardt for all choices at once."""
-        residual, jacobian = self._residual(signs, offsets)
-        cost, damping = residual.square().sum(-1) / 2, torch.ones_like(offsets[:, 0])
-        for _ in range(steps):
-            normal = jacobian.mT @ jacobian
-            diagonal = normal.diagonal(dim1=-2, dim2=-1)
-            ridge = damping[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True)
-            gradient = jacobian.mT @ residual[..., None]
-            step = torch.linalg.solve(normal + torch.diag_embed(ridge), gradient)[..., 0]
-            found = self._residual(signs, offsets + step)
-            new_cost = found[0].square().sum(-1) / 2
-            better = new_cost < cost
-            offsets = torch.where(better[:, None], offsets + step, offsets)
-            residual = torch.where(better[:, None], found[0], residual)
-            jacobian = torch.where(better[:, None, None], found[1], jacobian)
-            cost = torch.where(better, new_cost, cost)
-            damping = torch.where(better, damping / 5, damping * 5).clamp(1e-9, 1e9)
-        return offsets, cost
+        """The best offsets for all choices at once."""
+        return levenberg_marquardt(lambda tried: self._residual(signs, tried), offsets, steps)
 
     def _residual(self, signs: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """What is left (S, 6 n) in units of its accuracy, and how offsets lessen it."""

@@ -22,12 +22,14 @@ import tpgmm_datasets
 import tpgmm_evaluation
 import tpgmm_tools
 import tpgmm_torch
+import tpgmm_vision
 
 __all__ = ["documented", "internal_names", "modules", "setup"]
 
 PACKAGES = (
     tpgmm_torch,
     tpgmm_datasets,
+    tpgmm_vision,
     tpgmm_tools,
     lerobot_policy_tpgmm,
     lerobot_env_bimanual,
@@ -40,6 +42,7 @@ CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 NOT_CODE = (
     "tpgmm_tools.cli",
     "tpgmm_tools.app.command",
+    "tpgmm_vision.commands",
     "tpgmm_evaluation.command",
     "tpgmm_evaluation.metaworld.__main__",
 )

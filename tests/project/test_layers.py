@@ -36,7 +36,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
-        ("errors",),
+        ("errors", "least_squares"),
         ("names",),
         ("units", "robots"),
         ("checks",),
@@ -49,8 +49,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_vision": (
         ("poses",),
         ("camera", "targets", "sources"),
-        ("cell",),
+        ("cell", "printing"),
         ("detection", "watching"),
+        ("episodes",),
+        ("calibration",),
+        ("commands",),
     ),
     "tpgmm_tools": (
         ("hub", "plotting", "viewing"),

@@ -81,8 +81,9 @@ class CellObject:
     Parameters
     ----------
     target : Target
+        Without tags where another source finds the object.
     pose : ndarray of shape (4, 4)
-        Of the object's frame in that of the target.
+        Of the object's frame in that of the target, or in what the other source finds.
     upright : bool
         Whether its z axis is always vertical.
     height : float, optional
@@ -292,7 +293,10 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
 
 
 def _check_unique(cell: Cell, where: str) -> None:
-    """Each tag and each picture belongs to one entry."""
+    """Each tag and each picture belongs to one entry; objects that tags find have some."""
+    for name, thing in cell.objects.items():
+        if cell.source == "tags" and not thing.target.corners:
+            raise DataError(f"{where}: objects: {name} needs 'target', the tags on it")
     targets: list[tuple[str, CellObject | CellCheck]] = list(cell.objects.items())
     targets += cell.checks.items()
     owners: dict[tuple[str, int], str] = {}
@@ -407,9 +411,9 @@ def _camera(entry: _Entry) -> CellCamera:
 
 def _object(entry: _Entry) -> CellObject:
     entry.allow("target", "pose", "upright", "height")
-    pose, upright, height = (entry.get(name) for name in ("pose", "upright", "height"))
+    target, pose, upright, height = map(entry.get, ("target", "pose", "upright", "height"))
     return CellObject(
-        _target(entry.need("target")),
+        Target({}) if target is None else _target(target),
         np.eye(4) if pose is None else pose.pose(),
         upright is not None and upright.flag(),
         None if height is None else height.number(),

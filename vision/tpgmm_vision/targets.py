@@ -48,7 +48,8 @@ class Target:
     Parameters
     ----------
     corners : mapping of int to ndarray of shape (4, 3)
-        By the number of the tag: its corners in the frame of the target [m].
+        By the number of the tag: its corners in the frame of the target [m]. Empty for what has
+        no tags.
     family : str
         Of :data:`FAMILIES`.
     """
@@ -62,7 +63,7 @@ class Target:
                             f"{list(FAMILIES)}")  # fmt: skip
         count = len(cv2.aruco.getPredefinedDictionary(FAMILIES[self.family]).bytesList)
         wrong = [number for number in self.corners if not 0 <= number < count]
-        if wrong or not self.corners:
+        if wrong:
             raise DataError(
                 f"a target has tags 0 to {count - 1} of {self.family}, got {list(self.corners)}"
             )
@@ -141,6 +142,8 @@ def bundle(
     size : float
         Edge of the black squares [m].
     """
+    if not poses:
+        raise DataError("a bundle has at least one tag, got none")
     corners = {
         int(number): transformed(pose_matrix(pose), _square(size))
         for number, pose in poses.items()

@@ -1,0 +1,1 @@
+"""Commands that ``tpgmm`` finds by entry points."""

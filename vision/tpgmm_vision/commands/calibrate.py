@@ -1,0 +1,231 @@
+"""``tpgmm calibrate``: cameras by a board, cells by the robot's own motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from tpgmm_tools.cli import options
+from tpgmm_torch.atomic import read_whole
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+__all__ = ["app"]
+
+app = typer.Typer(help="Calibrate cameras and cells.", add_completion=False)
+
+
+@options.command(app, "tpgmm calibrate camera board/ --name front --cell cell.json")
+def camera(
+    pictures: Path,
+    *,
+    name: str,
+    cell: Path,
+    key: str | None = None,
+    link: str | None = None,
+    columns: int = 8,
+    rows: int = 5,
+    family: str = "aruco_5x5",
+    episodes: str | None = None,
+) -> None:
+    """Find a camera's focal length and distortion by pictures of a ChArUco board.
+
+    Take 20: the board flat, near every edge of the picture, tilted by 30 degrees to all sides.
+    'tpgmm camera print --board' prints one.
+
+    Parameters
+    ----------
+    pictures : ``DIR | VIDEO | SET``
+        A folder of pictures, a video, or a LeRobot data set.
+    name : str
+        Of the camera.
+    cell : ``CELL.json``
+        Where the result goes; other entries stay as they are.
+    key : ``FEATURE``
+        Of its pictures in data sets; default observation.images.NAME.
+    link : str
+        The robot's link that carries it, where it does not stand still.
+    columns, rows : int
+        Squares of the board.
+    family : ``NAME``
+        Of the tags in it.
+    episodes : ``0:10 | 0,3,5``
+        Of a data set; default all.
+    """
+    from tpgmm_vision.calibration.intrinsics import calibrate_camera
+    from tpgmm_vision.calibration.recorded import FRAMES, board_pictures, slow_postures
+    from tpgmm_vision.cell import CellCamera, camera_content, write_cell
+    from tpgmm_vision.targets import Board
+
+    content, key = _content(cell), key or f"observation.images.{name}"
+    if (pictures / "meta" / "info.json").exists():
+        recording = options.DataOptions(episodes=episodes, units=["raw"]).opened(
+            str(pictures), None, frames={}
+        )
+        with _progress("reading") as advance:
+            _, found = slow_postures(recording, {name: CellCamera(None, key)}, advance, FRAMES)
+        shown = {f"picture {k}": one for k, one in enumerate(found[name])}
+    else:
+        shown = board_pictures(pictures)
+    result = calibrate_camera(shown, Board(columns, rows, family=family))
+    entry = {**camera_content(result.camera, key), **({"link": link} if link else {})}
+    entry["report"] = str(result)
+    content.setdefault("cameras", {})[name] = entry
+    write_cell(content, cell)
+    for problem in result.problems:
+        typer.echo(f"unlikely: {problem}")
+    typer.echo(f"{name}: {result}")
+    typer.echo(f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ...")
+
+
+@options.command(
+    app,
+    "tpgmm calibrate cell waving --robot so101 --units lerobot --cell cell.json "
+    "--hand gripper_frame_link=cube:10,11,12,13,14:0.03",
+)
+def cell(
+    path: str,
+    *,
+    cell: Path,
+    described: options.RobotOptions,
+    hand: list[str] | None = None,
+    check: list[str] | None = None,
+    camera: list[str] | None = None,
+    base: list[str] | None = None,
+    units: list[str] | None = None,
+    joint_name: list[str] | None = None,
+    episodes: str | None = None,
+    out: Path = Path("calibration"),
+) -> None:
+    """Find where cameras are, and offsets of joints, by tags in the robot's own hand.
+
+    Record one episode in which the hand turns the tags before the cameras, stopping at 30
+    postures in which all joints differ by 45 degrees and more.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set with the cameras' pictures.
+    cell : ``CELL.json``
+        Has the cameras, as 'tpgmm calibrate camera' writes them; other entries stay as they are.
+    hand : ``LINK=TARGET``
+        Tags in a hand, repeatable: LINK=cube:10,11,12,13,14:0.03 has the numbers and the edge
+        of the black squares [m], LINK=tag:3:0.04 a single one.
+    check : ``NAME=TARGET``
+        Tags that stand still, repeatable, by which a camera that was moved is noticed.
+    camera : ``NAME``
+        Of the cell, repeatable; default all.
+    base : ``PREFIX``
+        The beginning of the names of an arm whose base is not known, repeatable.
+    units : ``[JOINT=]UNIT``
+        Unit of the stored joints, as of 'tpgmm fit', repeatable.
+    joint_name : ``STORED=JOINT``
+        The robot's name of a stored joint, as of 'tpgmm fit', repeatable.
+    episodes : ``0:10 | 0,3,5``
+        Which; default all.
+    out : ``DIR``
+        Where pictures with the corners that were seen and expected go.
+    """
+    import numpy as np
+
+    from tpgmm_vision.calibration.cell_calibration import Mount, calibrate_cell
+    from tpgmm_vision.calibration.recorded import slow_postures
+    from tpgmm_vision.cell import pose_content, read_cell, write_cell
+    from tpgmm_vision.detection.tags import TagDetector
+    from tpgmm_vision.episodes.report import drawn
+    from tpgmm_vision.targets import target_from
+
+    known, content = read_cell(cell), _content(cell)
+    for name in camera or ():
+        if name not in known.cameras:
+            raise UnknownNameError("camera", name, "the cell", known.cameras)
+    cameras = {name: one for name, one in known.cameras.items() if name in (camera or known.cameras)}
+    entries = {one.partition("=")[0]: _target(one) for one in [*(hand or ()), *(check or ())]}
+    mounts = {name: Mount(target_from(entry, name), name if k < len(hand or ()) else None)
+              for k, (name, entry) in enumerate(entries.items())}  # fmt: skip
+    if len({mount.target.family for mount in mounts.values()}) > 1:
+        raise DataError("all targets have tags of one family")
+    links = [mount.link for mount in mounts.values()] + [one.link for one in cameras.values()]
+    wanted = {*(described.link or ()), *(link for link in links if link)}
+    robot = replace(described, link=sorted(wanted)).read()
+    if robot is None:
+        raise DataError("a cell is calibrated by its robot: --robot FILE")
+    reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
+    with _progress("reading") as advance:
+        recording = reading.opened(path, robot, frames={})
+        joints, pictures = slow_postures(recording, cameras, advance)
+    find = TagDetector()
+    with _progress("looking for tags") as advance:
+        seen = {}
+        for k, (name, images) in enumerate(pictures.items()):
+            seen[name] = []
+            for image in images:
+                cameras[name].camera.check(image, name)
+                seen[name].append(find(image))
+                advance(k * len(images) + len(seen[name]), len(pictures) * len(images))
+    result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
+    for name, pose in result.cameras.items():
+        content["cameras"][name] |= {"pose": pose_content(pose), "report": str(result).splitlines()[0]}
+    for name, mount in mounts.items():
+        if mount.link is None:
+            content.setdefault("checks", {})[name] = {
+                "target": entries[name], "pose": pose_content(result.mounts[name]),
+            }  # fmt: skip
+    content["joints"] = list(robot.joint_names)
+    content["joint_offsets"] = {
+        name: round(value, 6) for name, value in result.joint_offsets.items()
+        if name not in result.unknown
+    }  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
+    for name, images in pictures.items():
+        for k, image in enumerate(images):
+            file = out / f"{name}_{k:03}.jpg"
+            file.write_bytes(drawn(image, seen[name][k].corners, result.expected[name][k]))
+    write_cell(content, cell)
+    typer.echo(f"{', '.join(result.cameras)}: {len(np.unique(joints, axis=0))} postures; {result}")
+    for prefix, moved in result.bases.items():
+        typer.echo(f"base of {prefix}: move it by {pose_content(moved)} in the base frame")
+    for problem in result.problems:
+        typer.echo(f"unlikely: {problem}")
+    typer.echo(
+        f"written to {cell}, pictures to {out}; next: tpgmm dataset track SET OUT --cell {cell}"
+    )
+
+
+def _target(text: str) -> dict[str, Any]:
+    """What a cell file says of a target that an option describes."""
+    name, _, described = text.partition("=")
+    try:
+        kind, numbers, size = described.split(":")
+        several = [int(number) for number in numbers.split(",")]
+        made = {"cube": several, "tag": several[0]}
+        return {kind: made[kind], "size": float(size)}
+    except (ValueError, KeyError) as error:
+        raise DataError(
+            f"tags are described as {name or 'NAME'}=cube:10,11,12,13,14:0.03 or "
+            f"{name or 'NAME'}=tag:3:0.04 (numbers, and the edge in metres), got {text!r}"
+        ) from error
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """What is in a cell file; nothing if there is none."""
+    from tpgmm_vision.cell import cell_from
+
+    content = json.loads(read_whole(path)) if path.exists() else {}
+    cell_from(content, str(path))
+    return content
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar, and what moves it."""
+    from rich.progress import Progress
+
+    with Progress(transient=True) as bar:
+        task = bar.add_task(what)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
