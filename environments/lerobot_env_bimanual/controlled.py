@@ -23,8 +23,8 @@ from lerobot_env_bimanual.disturbances import (
 )
 from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.eyes.lens import Imperfections, usual_camera
-from lerobot_env_bimanual.eyes.rig import Rig
-from lerobot_env_bimanual.eyes.views import CHECK, chosen_views
+from lerobot_env_bimanual.eyes.rig import Rig, View
+from lerobot_env_bimanual.eyes.views import CHECK, VIEWS, chosen_views
 from lerobot_env_bimanual.robot_scene import CAMERA, RobotScene
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Robot
@@ -98,6 +98,13 @@ class ControlledEnv(StateEnv):
         If an option is not one of the above.
     """
 
+    #: Units of joints, by which data sets are recorded; none are declared where it is empty.
+    units: ClassVar[Sequence[str] | None] = None
+    #: What LeRobot calls the robot; by default as the environment does.
+    robot_type: ClassVar[str | None] = None
+    #: Where cameras are, by their names, and tags that stand still.
+    views: ClassVar[Mapping[str, View]] = VIEWS
+    checks: ClassVar[Mapping[str, Carrier]] = CHECK
     #: The tags of the objects, by their names.
     carriers: ClassVar[Mapping[str, Carrier]] = {}
 
@@ -183,24 +190,30 @@ class ControlledEnv(StateEnv):
         """
         return Rig(
             self._scene,
-            chosen_views(cameras),
-            {**CHECK, **self.carriers} if carriers is None else carriers,
+            {name: self.views[name] for name in chosen_views(cameras)},
+            {**self.checks, **self.carriers} if carriers is None else carriers,
             objects,
             camera=usual_camera(*size),
             imperfections=imperfections,
         )
 
-    def cell(self) -> dict[str, Any]:
-        """The true cell file of the environment with its cameras.
+    @property
+    def recorded_names(self) -> list[str]:
+        """What the joints are called in data sets."""
+        return list(self.joint_names)
+
+    def cell(self, rig: Rig | None = None) -> dict[str, Any]:
+        """The true cell file of the environment with its cameras, or with those of a rig.
 
         Raises
         ------
         DataError
             If it has no cameras.
         """
-        if self._rig is None:
+        rig = rig or self._rig
+        if rig is None:
             raise DataError("the environment has no cameras: make it with cameras='front'")
-        return {**self._rig.content(), "joints": list(self.joint_names)}
+        return {**rig.content(), "joints": list(self.joint_names)}
 
     def close(self) -> None:
         """Free what the graphics library holds."""

@@ -11,7 +11,7 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Observation
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
@@ -34,6 +35,9 @@ from lerobot_env_bimanual.eyes.lens import Imperfections
 from lerobot_env_bimanual.eyes.recorder import CODECS, Recorder
 from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
+from lerobot_env_bimanual.so101 import TASKS
+from lerobot_env_bimanual.so101.env import BiSo101Env
+from lerobot_env_bimanual.so101.expert import teleoperated
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
@@ -67,11 +71,30 @@ class Expert:
         The demonstration that belongs to a seed.
     objects : tuple of str
         What is observed.
+    actions : callable, optional
+        In place of motions: gives the actions in an episode that has begun, one by one.
     """
 
     environment: Callable[..., ControlledEnv]
-    motion: Callable[[int], Demonstration]
+    motion: Callable[[int], Demonstration] | None
     objects: tuple[str, ...]
+    actions: Callable[[Any, np.random.Generator], Iterator[Vector]] | None = None
+
+    def begin(
+        self, env: ControlledEnv, rng: np.random.Generator
+    ) -> tuple[Observation, Iterable[Vector]]:
+        """Begin an episode; what is observed, and the actions."""
+        if self.motion is None:
+            assert self.actions is not None
+            observation, _ = env.reset(seed=int(rng.integers(2**31)))
+            return observation, self.actions(env, rng)
+        motion = self.motion(int(rng.integers(2**31)))
+        seed = int(rng.integers(2**31))
+        observation, _ = env.reset(seed=seed, options=self.start(motion))
+        ticks = np.arange(1, int(motion.time[-1] * env.fps + 1e-6) + 2) / env.fps
+        time = motion.time.numpy()
+        ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
+        return observation, np.stack(ways, axis=1)
 
     def start(self, motion: Demonstration) -> dict[str, Any]:
         """The options with which an episode begins as a demonstration does."""
@@ -103,14 +126,14 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
             return SuiteEnv(task, robot, **options)
 
         return Expert(made, drawn, able.objects)
-    if task not in BOTTLES:
+    if task not in ALONE:
         raise UnknownNameError("task", task, "the recorder", EXPERTS)
     if robot != UPPER_BODY:
-        raise DataError(f"{task} is done by {UPPER_BODY} alone, not by {robot!r}")
-    return BOTTLES[task]
+        raise DataError(f"{task} is done by its own robot alone, not by {robot!r}")
+    return ALONE[task]
 
 
-BOTTLES = {
+ALONE = {
     "bottle_shaking": Expert(
         partial(BottleShakingEnv, track=True),
         lambda seed: BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(1, seed)[0],
@@ -121,9 +144,10 @@ BOTTLES = {
         lambda seed: CarryAndPut(rate=RATE).demonstrations(1, seed)[0],
         ("bottle", "tray"),
     ),
+    "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperated),
 }
 #: What can be recorded.
-EXPERTS = (*BOTTLES, *SUITE)
+EXPERTS = (*ALONE, *SUITE)
 
 
 def record(
@@ -196,21 +220,21 @@ def record(
     recorder = Recorder(
         out,
         fps,
-        env.joint_names,
+        env.recorded_names,
         dict.fromkeys(rig.views, size),
-        {**rig.content(), "joints": list(env.joint_names)},
+        env.cell(rig),
         objects=able.objects if true_poses else (),
-        robot_type=robot,
+        units=env.units,
+        robot_type=env.robot_type or robot,
         codec=codec,
     )
     with recorder:
         for number in range(ATTEMPTS * n):
             # each has numbers of its own: episode 3 is the same, however many there are
             rng = np.random.default_rng((seed, number))
-            motion = able.motion(int(rng.integers(2**31)))
-            done = _follow(recorder, env, rig, motion, able.start(motion), rng, true_poses)
+            done, seconds = _follow(recorder, env, rig, able, rng, true_poses)
             progress(
-                f"episode {recorder.episodes} of {n}, {float(motion.time[-1]):.1f} s"
+                f"episode {recorder.episodes} of {n}, {seconds:.1f} s"
                 + ("" if done else ": one more failed, and was not kept")
             )
             if recorder.episodes == n:
@@ -299,30 +323,27 @@ def _follow(
     recorder: Recorder,
     env: ControlledEnv,
     rig: Any,
-    motion: Demonstration,
-    start: dict[str, Any],
+    able: Expert,
     rng: np.random.Generator,
     true_poses: bool,
-) -> bool:
-    """Record an episode; whether it succeeds, and is kept."""
-    observation, _ = env.reset(seed=int(rng.integers(2**31)), options=start)
-    ticks = np.arange(1, int(motion.time[-1] * env.fps + 1e-6) + 2) / env.fps
-    time = motion.time.numpy()
-    ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
-    over, info = False, {}
-    for reference in np.stack(ways, axis=1):
+) -> tuple[bool, float]:
+    """Record an episode; whether it succeeds, and is kept, and its seconds."""
+    observation, actions = able.begin(env, rng)
+    over, info, seconds = False, {}, 0.0
+    for reference in actions:
         poses = observation["environment_state"] if true_poses else None
         recorder.add(
             observation["agent_pos"], reference, rig.pictures(rng), env.task_description, poses
         )
         observation, _, _, over, info = env.step(reference)
+        seconds += 1 / env.fps
     while not over:
         *_, over, info = env.step(reference)
     if info["is_success"]:
         recorder.save()
     else:
         recorder.discard()
-    return bool(info["is_success"])
+    return bool(info["is_success"]), seconds
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -35,14 +35,14 @@ TASK = "show the tags in the hand to the camera"
 
 
 def chain_of(rig: Rig, link: str) -> NDArray[np.intp]:
-    """The numbers of the joints that move a link, from its base on."""
+    """The numbers of the driven joints that move a link."""
     model = rig.scene.model
-    body, found = model.body(link).id, list[int]()
+    body, bodies = model.body(link).id, set[int]()
     while body:
-        first = model.body_jntadr[body]
-        found += range(first, first + model.body_jntnum[body])
+        bodies.add(int(body))
         body = model.body_parentid[body]
-    return np.array(sorted(one for one in found if one < model.nu), dtype=np.intp)
+    driven = model.jnt_bodyid[model.actuator_trnid[:, 0]]
+    return np.flatnonzero([int(one) in bodies for one in driven])
 
 
 def varied_postures(
@@ -74,13 +74,14 @@ def varied_postures(
     scene = rig.scene
     model, before = scene.model, scene.data.qpos.copy()
     moved, camera = chain_of(rig, link), camera or next(iter(rig.views))
-    low, high = model.jnt_range[moved].T
+    driven = model.actuator_trnid[:, 0]
+    low, high = model.jnt_range[driven[moved]].T
     low, high = (low + high) / 2 + (high - low) * RANGE / 2 * np.array([[-1], [1]])
     start, kept, seen = scene.joints, list[NDArray[np.float64]](), list[Array]()
     for _ in range(DRAWN):
         joints = start.copy()
         joints[moved] = rng.uniform(low, high)
-        scene.data.qpos[: len(joints)] = joints
+        scene.data.qpos[model.jnt_qposadr[driven]] = joints
         mujoco.mj_kinematics(model, scene.data)
         if _shown(rig, camera, link):
             kept.append(joints)

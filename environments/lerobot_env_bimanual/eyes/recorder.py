@@ -44,7 +44,7 @@ class Recorder:
     objects : sequence of str, default=()
         Whose poses are recorded too, in ``observation.environment_state``.
     units : sequence of str, optional
-        Of the joints; radians by default.
+        Of the joints; radians by default. Empty to declare none, as LeRobot does.
     robot_type : str, optional
     codec : {"av1", "h264", "pictures"}, default="av1"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,9 +15,8 @@ from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course, displaced
 from lerobot_env_bimanual.eyes.carriers import cube_at
-from lerobot_env_bimanual.eyes.lens import Imperfections, usual_camera
 from lerobot_env_bimanual.eyes.rig import Rig
-from lerobot_env_bimanual.eyes.views import around, chosen_views
+from lerobot_env_bimanual.eyes.views import around
 from lerobot_env_bimanual.so101 import TASKS
 from lerobot_env_bimanual.so101.kinematics import Reach
 from lerobot_env_bimanual.so101.robot import SIDES
@@ -27,7 +26,6 @@ from lerobot_env_bimanual.so101.scene import (
     LEFT_UP,
     RIGHT,
     RIGHT_UP,
-    SAUCER_TOP,
     BiSo101Scene,
     in_left_hand,
 )
@@ -64,7 +62,7 @@ DURATION, COURSE = 17.0, Course(grasp=4.0, latest=9.0, end=11.5)
 #: beside the left arm, by which one that was moved is noticed.
 CENTRE = (0.20, 0.0, 0.11)
 VIEWS = {"front": around(CENTRE, 0.7, 0.0, 40.0), "side": around(CENTRE, 0.7, -50.0, 40.0)}
-CHECK = {"world": cube_at(0, 0.08, 0.35, 0.05)}
+CHECKS = {"world": cube_at(0, 0.08, 0.35, 0.05)}
 
 
 class BiSo101Env(ControlledEnv):
@@ -104,7 +102,11 @@ class BiSo101Env(ControlledEnv):
         If an option is not one of the above.
     """
 
+    views: ClassVar = VIEWS
+    checks: ClassVar = CHECKS
     carriers: ClassVar = CARRIERS
+    units: ClassVar = ()
+    robot_type: ClassVar = "bi_so_follower"
     _scene: BiSo101Scene
 
     def __init__(
@@ -127,7 +129,9 @@ class BiSo101Env(ControlledEnv):
         self.task, self.task_description = task, "put the cup on the saucer"
         self._reach = {side: Reach(self._scene, side) for side in SIDES}
         bounds = self.stored(low), self.stored(high)
-        self.action_space = spaces.Box(*(b.astype(np.float32) for b in bounds), dtype=np.float32)
+        self.action_space = spaces.Box(
+            *(b.astype(np.float32) for b in bounds), dtype=np.float32
+        )
         self.observation_space["agent_pos"] = spaces.Box(
             bounds[0] - 30.0, bounds[1] + 30.0, dtype=np.float64
         )
@@ -137,26 +141,19 @@ class BiSo101Env(ControlledEnv):
         """The simulated world, which an expert sees."""
         return self._scene
 
+    @property
+    def recorded_names(self) -> list[str]:
+        """As LeRobot's ``bi_so_follower`` calls its motors."""
+        return [f"{name}.pos" for name in self.joint_names]
+
     def stored(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
         return np.asarray((joints - self._zero) / self._factor)
 
-    def rig(
-        self,
-        cameras: str | Sequence[str],
-        size: tuple[int, int] = (640, 480),
-        imperfections: Imperfections | None = None,
-    ) -> Rig:
-        """Cameras before the arms, and tags on the objects and beside the left arm."""
-        views = {name: VIEWS[name] for name in chosen_views(cameras)}
-        carriers = {**CHECK, **self.carriers}
-        camera = usual_camera(*size)
-        return Rig(self._scene, views, carriers, camera=camera, imperfections=imperfections)
-
-    def cell(self) -> dict[str, Any]:
+    def cell(self, rig: Rig | None = None) -> dict[str, Any]:
         """The true cell file of the environment with its cameras, with the offsets."""
         pairs = zip(self.joint_names, self.offsets.tolist(), strict=True)
-        return {**super().cell(), "joint_offsets": {name: off for name, off in pairs if off}}
+        return {**super().cell(rig), "joint_offsets": {name: off for name, off in pairs if off}}
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far."""
@@ -182,7 +179,9 @@ class BiSo101Env(ControlledEnv):
         left = self._reach["left"](SEEDS["left"], saucer[:3], held[:3], LEFT_UP)
         right = self._reach["right"](SEEDS["right"], grip[:3], GRIP, RIGHT_UP)
         low, high = self._lower, self._upper
-        joints = np.concatenate((left, low[5:6], right, low[11:] + OPEN / 100 * (high - low)[11:]))
+        joints = np.concatenate(
+            (left, low[5:6], right, low[11:] + OPEN / 100 * (high - low)[11:])
+        )
         drawn = Start.drawn(rng, self.model, 2)
         start = Start(joints=joints, poses={"cup": cup}, **drawn).given(options, self.model)
         self._scene.reset({**start.poses, "saucer": held}, start.joints)

@@ -106,8 +106,12 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
                 gripper = OPEN * (_jerk(first) if phase == "open" else 1 - _jerk(second))
             if phase in BRINGING:
                 spent += 1 / env.fps
-                left.move(brought + _jerk(min(1.0, spent / total)) * (meeting - brought), *carried)
-            action = env.stored(np.concatenate((left.command(env), [0.0], right.command(env), [0.0])))
+                left.move(
+                    brought + _jerk(min(1.0, spent / total)) * (meeting - brought), *carried
+                )
+            action = env.stored(
+                np.concatenate((left.command(env), [0.0], right.command(env), [0.0]))
+            )
             action[ARM], action[-1] = 0.0, gripper
             yield action
 

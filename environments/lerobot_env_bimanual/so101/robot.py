@@ -95,7 +95,9 @@ def _draw(spec: mujoco.MjSpec, side: str) -> None:
         add_geom(body, capsule, size, fromto=(0, 0, 0, *end), rgba=_DRAWN, mass=mass)
     look = {"contype": PALM, "rgba": _JAWS}
     hand, jaw = spec.body(hand_of(side)), spec.body(f"{side}_moving_jaw_so101_v1_link")
-    add_geom(hand, BOX, (*JAW[:1], JAW[2], 0.035), name=f"{side[0]}_palm", pos=FIXED_JAW, **look)
+    add_geom(
+        hand, BOX, (*JAW[:1], JAW[2], 0.035), name=f"{side[0]}_palm", pos=FIXED_JAW, **look
+    )
     turn = np.array((math.sin(JAW_TURN), -math.cos(JAW_TURN))) * JAW_MIDDLE
     add_geom(
         jaw, BOX, JAW, name=f"{side[0]}_jaw", pos=(*turn, JAW_ASIDE), mass=JAW_MASS,

@@ -163,7 +163,7 @@ def _add_saucer(spec: Any) -> None:
     add_geom(saucer, CYLINDER, size, name="saucer", mass=0.05, conaffinity=PALM, **look)
     # what stands on it is pushed up, however deep a hand has pressed it in
     top, below = (0.7 * SAUCER, 0.7 * SAUCER, DEPTH), (0.0, 0.0, SAUCER_TOP - DEPTH)
-    stop = {"contype": OBJECT, "conaffinity": OBJECT, "group": 3}
+    stop = {"contype": OBJECT, "conaffinity": OBJECT | TABLE, "group": 3}
     add_geom(saucer, BOX, top, pos=below, mass=0, **stop)
     add_geom(saucer, BOX, (BLOCK,) * 3, pos=SAUCER_CUBE, mass=0.02, **look)
 
