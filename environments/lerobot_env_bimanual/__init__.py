@@ -22,8 +22,8 @@ from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
-    "AlohaStateConfig", "BiSo101Config", "BimanualConfig", "BottleShakingConfig", "BottleTorqueConfig",
-    "CarryAndPutConfig", "MetaworldStateConfig",
+    "AlohaStateConfig", "BiSo101Config", "BimanualConfig", "BottleShakingConfig",
+    "BottleTorqueConfig", "CarryAndPutConfig", "MetaworldStateConfig",
 ]  # fmt: skip
 
 _PACKAGE = "lerobot_env_bimanual"

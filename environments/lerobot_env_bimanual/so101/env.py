@@ -17,7 +17,7 @@ from lerobot_env_bimanual.disturbances import Course, displaced
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import around
-from lerobot_env_bimanual.so101 import TASKS
+from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
 from lerobot_env_bimanual.so101.kinematics import Reach
 from lerobot_env_bimanual.so101.robot import SIDES
 from lerobot_env_bimanual.so101.scene import (
@@ -54,6 +54,8 @@ RIGHT_BOX = Box((0.19, -0.22, 0.14), (0.23, -0.16, 0.18), 0.0)
 HELD_ASIDE, HELD_TURN = 0.004, math.radians(5.0)
 #: Postures from which inverse kinematics begins [rad]: the elbow is up.
 SEEDS = {"left": (0.3, 0.0, 0.6, 0.0, 0.0), "right": (-0.3, 0.0, 0.6, 0.3, 1.57)}
+#: Where the grippers are among the joints.
+GRIPPERS = [5, 11]
 #: An open gripper, of 100.
 OPEN = 40.0
 #: How long an episode takes [s], and when what happens in it.
@@ -115,14 +117,13 @@ class BiSo101Env(ControlledEnv):
         if task not in TASKS:
             raise UnknownNameError("task", task, "the SO-101 arms", TASKS)
         self.model = parse_robot(bi_so101_urdf())
-        names = self.model.joint_names
-        grippers = np.array([name.endswith("gripper") for name in names])
-        drawn = np.random.default_rng(specimen).standard_normal(len(names))
-        self.offsets = np.where(grippers, 0.0, OFFSET * drawn)
+        self.offsets = OFFSET * np.random.default_rng(specimen).standard_normal(N_JOINTS)
+        self.offsets[GRIPPERS] = 0.0
         low, high = self.model.lower.numpy(), self.model.upper.numpy()
         # radians = factor * stored + zero
-        self._factor = np.where(grippers, (high - low) / 100, math.pi / 180)
-        self._zero = np.where(grippers, low, self.offsets)
+        self._factor, self._zero = np.full(N_JOINTS, math.pi / 180), self.offsets.copy()
+        self._factor[GRIPPERS] = (high - low)[GRIPPERS] / 100
+        self._zero[GRIPPERS] = low[GRIPPERS]
         super().__init__(
             self.model, BiSo101Scene(), DURATION, COURSE, fps=fps, track=True, **options
         )
@@ -173,15 +174,13 @@ class BiSo101Env(ControlledEnv):
         return successful(figures, FIGURES)
 
     def _begin(self, options: Mapping[str, Any]) -> Start:
-        rng, names = self.np_random, self.model.joint_names
+        rng = self.np_random
         cup, saucer, grip = (box.draw(rng) for box in (CUP_BOX, SAUCER_BOX, RIGHT_BOX))
         held = in_left_hand(*rng.uniform(-1, 1, 2) * (HELD_ASIDE, HELD_TURN))
         left = self._reach["left"](SEEDS["left"], saucer[:3], held[:3], LEFT_UP)
         right = self._reach["right"](SEEDS["right"], grip[:3], GRIP, RIGHT_UP)
-        low, high = self._lower, self._upper
-        joints = np.concatenate(
-            (left, low[5:6], right, low[11:] + OPEN / 100 * (high - low)[11:])
-        )
+        joints = np.concatenate((left, [0.0], right, [0.0]))
+        joints[GRIPPERS] = self._zero[GRIPPERS] + self._factor[GRIPPERS] * (0.0, OPEN)
         drawn = Start.drawn(rng, self.model, 2)
         start = Start(joints=joints, poses={"cup": cup}, **drawn).given(options, self.model)
         self._scene.reset({**start.poses, "saucer": held}, start.joints)

@@ -73,7 +73,7 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
     gripper = OPEN
     for phase, seconds in bringing.items():
         ticks = max(1, round(seconds * env.fps))
-        stem = scene.pose("cup")[:3] + (0.0, 0.0, STEM)
+        stem = _above(scene.pose("cup"), STEM)
         heading = right.heading(stem)
         point = (np.array(GRIP), np.array(RIGHT_UP))
         if phase in ("lift", "bring", "hover", "lower"):
@@ -87,10 +87,10 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
                 "reach": stem - BEHIND * heading + aside,
                 "approach": stem + aside,
                 "close": stem,
-                "lift": begin + (0.0, 0.0, LIFT),
-                "bring": saucer + (0.0, 0.0, ABOVE),
-                "hover": saucer + (0.0, 0.0, ABOVE),
-                "lower": saucer + (0.0, 0.0, SAUCER_TOP),
+                "lift": _above(begin, LIFT),
+                "bring": _above(saucer, ABOVE),
+                "hover": _above(saucer, ABOVE),
+                "lower": _above(saucer, SAUCER_TOP),
                 "open": begin + aside,
                 "leave": begin - BEHIND * heading,
             }.get(phase)
@@ -106,14 +106,17 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
                 gripper = OPEN * (_jerk(first) if phase == "open" else 1 - _jerk(second))
             if phase in BRINGING:
                 spent += 1 / env.fps
-                left.move(
-                    brought + _jerk(min(1.0, spent / total)) * (meeting - brought), *carried
-                )
-            action = env.stored(
-                np.concatenate((left.command(env), [0.0], right.command(env), [0.0]))
-            )
+                done = _jerk(min(1.0, spent / total))
+                left.move(brought + done * (meeting - brought), *carried)
+            joints = np.concatenate((left.command(env), [0.0], right.command(env), [0.0]))
+            action = env.stored(joints)
             action[ARM], action[-1] = 0.0, gripper
             yield action
+
+
+def _above(pose: Array, height: float) -> Array:
+    """A place (3,) so far above that of a pose."""
+    return np.asarray(pose[:3] + np.array((0.0, 0.0, height)))
 
 
 def _jerk(share: float) -> float:

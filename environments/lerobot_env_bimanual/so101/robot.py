@@ -17,8 +17,8 @@ SIDES = ("left", "right")
 BACKLASH = math.radians(0.4)
 #: What the joint behind a motor is called.
 PLAY = "_play"
-#: A servo STS3215: stiffness [N m / rad], so soft that gravity bends the stretched arm by 2
-#: degrees at the shoulder; damping [N m s / rad], friction and largest torque [N m], and the
+#: A servo STS3215: stiffness [N m / rad], so soft that gravity bends each of the joints that
+#: carry the stretched arm by up to 2 degrees; damping [N m s / rad], friction and largest torque [N m], and the
 #: inertia of its rotor behind the gears [kg m^2].
 STIFFNESS, DAMPING, FRICTION, TORQUE, ROTOR = 17.8, 0.6, 0.05, 3.0, 0.028
 #: Largest torque of the gripper, that of LeRobot's settings (half of the others') [N m].
@@ -37,8 +37,8 @@ LINKS = {
 JAW, JAW_MASS, JAW_MIDDLE, JAW_TURN = (0.004, 0.04, 0.008), 0.012, 0.04, -0.118
 #: How far the moving jaw is beside the middle of the gripper, in its link's frame [m].
 JAW_ASIDE = 0.019
-#: Middle of the fixed jaw in the frame between the ends of the jaws [m].
-FIXED_JAW = (0.008, 0.0, -0.03)
+#: Middle of the fixed jaw in the frame between the ends of the jaws, and half its length [m].
+FIXED_JAW, FIXED_JAW_HALF = (0.008, 0.0, -0.03), 0.035
 _DRAWN, _JAWS = (0.95, 0.75, 0.2, 1), (0.25, 0.25, 0.28, 1)
 
 
@@ -54,8 +54,8 @@ def so101_spec() -> mujoco.MjSpec:
     -------
     mujoco.MjSpec
         A joint NAME is where the motor is, as its encoder measures; NAME_play behind it is free
-        within the backlash. Geoms ``left_jaw``, ``left_palm`` (the fixed jaw) and the right ones
-        touch what has the bit ``PALM``.
+        within the backlash. Geoms ``l_jaw``, ``l_palm`` (the fixed jaw) and the right ones touch
+        what has the bit ``PALM``.
     """
     spec = mujoco.MjSpec.from_string(bi_so101_urdf())
     spec.compiler.fusestatic = spec.compiler.discardvisual = False
@@ -95,9 +95,8 @@ def _draw(spec: mujoco.MjSpec, side: str) -> None:
         add_geom(body, capsule, size, fromto=(0, 0, 0, *end), rgba=_DRAWN, mass=mass)
     look = {"contype": PALM, "rgba": _JAWS}
     hand, jaw = spec.body(hand_of(side)), spec.body(f"{side}_moving_jaw_so101_v1_link")
-    add_geom(
-        hand, BOX, (*JAW[:1], JAW[2], 0.035), name=f"{side[0]}_palm", pos=FIXED_JAW, **look
-    )
+    palm = (JAW[0], JAW[2], FIXED_JAW_HALF)
+    add_geom(hand, BOX, palm, name=f"{side[0]}_palm", pos=FIXED_JAW, **look)
     turn = np.array((math.sin(JAW_TURN), -math.cos(JAW_TURN))) * JAW_MIDDLE
     add_geom(
         jaw, BOX, JAW, name=f"{side[0]}_jaw", pos=(*turn, JAW_ASIDE), mass=JAW_MASS,

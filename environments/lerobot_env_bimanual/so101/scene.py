@@ -52,10 +52,10 @@ CARRIERS = {
     "saucer": cube_at(20, *SAUCER_CUBE, size=TAG),
 }
 #: Where the stem is in the right gripper, seen from the link between its jaws: beside the fixed
-#: jaw, and not at the very ends; how far ahead of the left one the middle of the saucer is [m].
+#: jaw, and not at the very ends; how far ahead of the left one the saucer's middle is [m].
 GRIP, HELD_AHEAD = (-0.006, 0.0, -0.012), 0.045
-#: How the hands then point: down by so much [rad]. Which axis of each is vertical then, pointing
-#: up, follows.
+#: How the hands then point: down by so much [rad]; and which axis of each is then vertical,
+#: upwards.
 RIGHT_TILT, LEFT_TILT = math.radians(40.0), math.radians(30.0)
 RIGHT_UP = (0.0, -math.cos(RIGHT_TILT), -math.sin(RIGHT_TILT))
 LEFT_UP = (-math.cos(LEFT_TILT), 0.0, -math.sin(LEFT_TILT))

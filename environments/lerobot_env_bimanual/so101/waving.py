@@ -18,6 +18,8 @@ __all__ = ["IN_HAND", "record_waving"]
 
 #: The first number of the cube of tags in each gripper.
 IN_HAND = {"left": 30, "right": 40}
+#: The joints of each arm.
+PARTS = {"left": slice(0, 6), "right": slice(6, 12)}
 #: Where cup and saucer are meanwhile [m].
 AWAY = {"cup": (0.5, 0.45, 0.0), "saucer": (0.5, -0.45, 0.03)}
 
@@ -64,7 +66,7 @@ def record_waving(
     cubes = {hand_of(side): cube_at(first, z=CUBE, size=TAG) for side, first in IN_HAND.items()}
     rig = env.rig(cameras, size, carriers={**CHECKS, **cubes}, objects={})
     postures = np.concatenate(
-        [varied_postures(rig, hand_of(side), n, rng)[:, part] for side, part in PARTS.items()],
+        [varied_postures(rig, hand_of(side), n, rng)[:, PARTS[side]] for side in SIDES],
         axis=1,
     )
     recorder = Recorder(
@@ -82,7 +84,3 @@ def record_waving(
     rig.close()
     env.close()
     return Path(out)
-
-
-#: The joints of each arm.
-PARTS = {side: slice(6 * k, 6 * k + 6) for k, side in enumerate(SIDES)}
