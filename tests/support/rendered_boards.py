@@ -46,7 +46,11 @@ class BoardCamera:
         self, rng: np.random.Generator, tilt: tuple[float, float] = (10, 45), away: float = 1.0
     ) -> Array:
         """Somewhere before the camera, tilted by so many degrees."""
-        lean, side, roll = *np.radians(rng.uniform(*tilt, 1)), rng.uniform(0, 7), rng.uniform(-1, 1)
+        lean, side, roll = (
+            *np.radians(rng.uniform(*tilt, 1)),
+            rng.uniform(0, 7),
+            rng.uniform(-1, 1),
+        )
         turn = Rotation.from_rotvec([lean * np.cos(side), lean * np.sin(side), 0])
         turn = turn * Rotation.from_rotvec([0, 0, roll / 2])
         z = rng.uniform(0.3, 0.6)

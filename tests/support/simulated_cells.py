@@ -1,10 +1,14 @@
 """Cells whose cameras, tags and offsets are known, and what their cameras see."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from tpgmm_datasets.robots import bi_so101_urdf, so101_urdf, upper_body_urdf
 from tpgmm_torch import Robot
@@ -20,6 +24,8 @@ CUBE, OTHER, LARGE = (
     cube([first + i for i in range(5)], size)
     for first, size in ((10, 0.03), (20, 0.03), (10, 0.04))
 )
+#: Pixels of a module of a drawn tag, and drawn pixels of a picture's pixel.
+MODULE, FINE = 16, 4
 IN_HAND = rigid(np.radians([10, 20, 30]), (0.0, 0.0, -0.05))
 
 
@@ -89,12 +95,16 @@ class SimulatedCell:
         """
         side = rng.choice([-1.0, 1.0], joints.shape)
         if self.gravity:
-            rise = self.robot.state(torch.as_tensor(joints)).jacobians[..., 2, :].sum(-2).numpy()
+            rise = (
+                self.robot.state(torch.as_tensor(joints)).jacobians[..., 2, :].sum(-2).numpy()
+            )
             side = np.where(np.abs(rise) > 0.01, np.sign(rise), side)
         side *= self.backlash / 2
         return joints - self.offsets + side + rng.normal(0, self.joint_noise, joints.shape)
 
-    def corners(self, joints: Array, rng: np.random.Generator) -> dict[str, list[dict[int, Array]]]:
+    def corners(
+        self, joints: Array, rng: np.random.Generator
+    ) -> dict[str, list[dict[int, Array]]]:
         """By camera, the corners of tags at joints."""
         found: dict[str, list[dict[int, Array]]] = {}
         held = [(t, self.links(joints, link) @ pose) for t, pose, link in self.targets.values()]
@@ -104,7 +114,9 @@ class SimulatedCell:
                 {
                     number: pixels + rng.normal(0, self.pixels, (4, 2))
                     for target, poses in held
-                    for number, pixels in visible(self.camera, back[k] @ poses[k], target).items()
+                    for number, pixels in visible(
+                        self.camera, back[k] @ poses[k], target
+                    ).items()
                 }
                 for k in range(len(joints))
             ]
@@ -114,16 +126,21 @@ class SimulatedCell:
         """Joints at which each camera sees a tag, and hands are above the table."""
         found: list[Array] = []
         while len(found) < n:
-            joints = self.middle + rng.uniform(-self.reach, self.reach, (64, self.robot.n_joints))
+            joints = self.middle + rng.uniform(
+                -self.reach, self.reach, (64, self.robot.n_joints)
+            )
             seen = self.corners(joints, rng)
             high = np.all([self.links(joints, l)[:, 2, 3] > 0.03 for l in self.robot.links], 0)
             found += [
-                joints[k] for k in range(64)
+                joints[k]
+                for k in range(64)
                 if high[k] and all(len(one[k]) >= least for one in seen.values())
             ]
         return np.array(found[:n])
 
-    def recorded(self, n: int, rng: np.random.Generator) -> tuple[Array, dict[str, list[Detections]]]:
+    def recorded(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Array, dict[str, list[Detections]]]:
         joints = self.postures(n, rng)
         seen = {k: [Detections(c) for c in v] for k, v in self.corners(joints, rng).items()}
         return self.measured(joints, rng), seen
@@ -181,3 +198,61 @@ def two_arm_cell(offset: float, rng: np.random.Generator, **settings: Any) -> Si
         offsets, bases=("right_",), base=rigid((0, 0, np.radians(3)), (0.02, -0.02, 0.01)),
         middle=0.35 * (lower + upper), reach=0.35 * (upper - lower), **settings,
     )  # fmt: skip
+
+
+def drawn(
+    camera: Camera, tags: dict[int, Array], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """A picture of tags whose corners are given, with noise."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    size = camera.width * FINE, camera.height * FINE
+    picture = np.full(size[::-1], 150, np.uint8)
+    edges = np.array([[1, 1], [9, 1], [9, 9], [1, 9]]) * MODULE - 0.5
+    for number, corners in tags.items():
+        inside = cv2.aruco.generateImageMarker(dictionary, number, 8 * MODULE)
+        texture = np.pad(inside, MODULE, constant_values=255)
+        shape = cv2.getPerspectiveTransform(
+            edges.astype(np.float32), ((corners + 0.5) * FINE - 0.5).astype(np.float32)
+        )
+        cv2.warpPerspective(
+            texture, shape, size, picture, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
+        )
+    small = cv2.resize(picture, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA)
+    small = small + rng.normal(scale=2.0, size=small.shape)
+    return np.repeat(small.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def record(root: Path, cell: SimulatedCell, postures: Array, rng: np.random.Generator) -> Path:
+    """A LeRobot data set of a robot that goes from posture to posture and stops at each."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    names = [f"{name}.pos" for name in cell.robot.joint_names]
+    joints = {"dtype": "float32", "shape": (len(names),), "names": names}
+    shape = cell.camera.height, cell.camera.width, 3
+    video = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
+    keys = {name: f"observation.images.{name}" for name in cell.cameras}
+    features = {
+        "observation.state": joints,
+        "action": joints,
+        **dict.fromkeys(keys.values(), video),
+    }
+    made = LeRobotDataset.create(
+        "test/cell", 10, features, root=root, robot_type="so101_follower", use_videos=True,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264"),
+    )  # fmt: skip
+    path = [postures[:1]]
+    for one, other in pairwise(postures):  # half way is quick, then it stands still
+        path += [(one + other)[None] / 2, other[None], other[None], other[None]]
+    true = np.concatenate(path)
+    measured = np.repeat(cell.measured(postures, rng), 4, axis=0)[3:]
+    measured[1::4] = true[1::4]
+    seen = cell.corners(true, rng)
+    for k, row in enumerate(np.degrees(measured).astype(np.float32)):
+        pictures = {
+            keys[name]: drawn(cell.camera, found[k], rng) for name, found in seen.items()
+        }
+        made.add_frame({"observation.state": row, "action": row, "task": "wave", **pictures})
+    made.save_episode()
+    made.finalize()
+    return root

@@ -75,7 +75,9 @@ class Adjustment:
         free, found = self.problem.free, np.zeros((self.problem.n_steps,) * 2)
         known = np.tile(1 / np.repeat(POSE_PRIOR, 3) ** 2, self.problem.n_poses)
         weak = np.concatenate((known, np.zeros(len(free) - len(known))))[free]
-        found[np.ix_(free, free)] = np.linalg.inv(self.jacobian.T @ self.jacobian + np.diag(weak))
+        found[np.ix_(free, free)] = np.linalg.inv(
+            self.jacobian.T @ self.jacobian + np.diag(weak)
+        )
         return found
 
 
@@ -189,7 +191,13 @@ def _noise(
         inside = 1 + ratio * values
         square = (total - (ratio * share / inside).sum()) / variance
         return float(
-            (errors.size * 2 * logs[0] - 2 * np.log(weights).sum() + np.log(inside).sum() + square) / 2
+            (
+                errors.size * 2 * logs[0]
+                - 2 * np.log(weights).sum()
+                + np.log(inside).sum()
+                + square
+            )
+            / 2
         )
 
     if given is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,7 +17,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.calibration.adjustment import OFFSET_PRIOR, Adjustment, adjust
 from tpgmm_vision.calibration.reprojection import Corners, Integers, Reprojection
 from tpgmm_vision.cell import CellCamera
-from tpgmm_vision.detection.estimation import PoseEstimate, View, estimate_pose
+from tpgmm_vision.detection.estimation import View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
 from tpgmm_vision.poses import Array, angle_between, inverse, mean_pose, rigid
 from tpgmm_vision.targets import Target
@@ -33,8 +35,8 @@ LEAST_PICTURES, FOLDS = 8, 5
 WRONG_TAG = 10.0
 #: Offsets that are known no better than this share of what was known before are not known.
 UNKNOWN_SHARE = 0.5
-#: The error between object and hand that a calibration may expect anywhere [m].
-LARGEST_EXPECTED = 0.01
+#: The error between object and hand that offsets and poses which are not known may add [m].
+LARGEST_EXPECTED = 0.003
 #: It is expected at so many postures, at most so far from the mean of those recorded [rad].
 ELSEWHERE, LIKELY_REACH = 50, 0.5
 #: Less than this is no step of a camera or a target [m, rad].
@@ -84,8 +86,8 @@ class CellCalibration:
         Standard deviation of what is left [rad].
     problems : tuple of str
         What does not fit, and its remedy.
-    expected : dict of str to list of dict of int to ndarray of shape (4, 2)
-        Where the corners of tags are expected, by camera and picture [pixels].
+    expected : dict of (str, int) to dict of int to ndarray of shape (4, 2)
+        Where the corners of tags are expected, by camera and picture, then number [pixels].
     """
 
     cameras: dict[str, Array]
@@ -98,18 +100,17 @@ class CellCalibration:
     angle_errors: Array
     joint_noise: float
     problems: tuple[str, ...]
-    expected: dict[str, list[dict[int, Array]]]
+    expected: Mapping[tuple[str, int], dict[int, Array]]
 
     def __str__(self) -> str:
         far, turned = (
             np.quantile(values, (0.5, 0.95))
             for values in (1e3 * self.position_errors, np.degrees(self.angle_errors))
         )
-        known = [name for name in self.joint_offsets if name not in self.unknown]
         offsets = [
-            f"{name} {np.degrees(self.joint_offsets[name]):+.2f} "
-            f"+- {np.degrees(self.uncertainty[name]):.2f}"
-            for name in known
+            f"{name} {np.degrees(value):+.2f} +- {np.degrees(self.uncertainty[name]):.2f}"
+            for name, value in self.joint_offsets.items()
+            if name not in self.unknown
         ]
         lines = [
             f"error between object and hand, on pictures left out: {far[0]:.1f} mm (median), "
@@ -118,8 +119,7 @@ class CellCalibration:
         ]
         if self.unknown:
             lines.append(
-                f"not known, and not needed, as poses of cameras and tags make up for them: "
-                f"the offsets of {', '.join(self.unknown)}"
+                f"not known from these postures, poses make up for them: {', '.join(self.unknown)}"
             )
         return "\n".join(lines)
 
@@ -159,7 +159,9 @@ def calibrate_cell(
     UnknownNameError
         If there is no such camera or link.
     """
-    task = _Task.of(robot, joints, seen, cameras, mounts, bases)
+    given = np.asarray(joints, dtype=float), robot, seen, cameras, mounts, bases
+    _check(*given)
+    task = _Task.of(*given)
     first = adjust(task.problem, task.start(), robust=True)
     wrong = first.misfit > WRONG_TAG**2
     problem = replace(task.problem, corners=task.problem.corners.of(np.repeat(~wrong, 4)))
@@ -195,315 +197,279 @@ class _Task:
 
     @classmethod
     def of(
-        cls,
-        robot: Kinematics,
-        joints: ArrayLike,
-        seen: Mapping[str, Sequence[Detections]],
-        cameras: Mapping[str, CellCamera],
-        mounts: Mapping[str, Mount],
-        bases: Sequence[str],
-    ) -> _Task:
-        """Check what is given, and put all corners in a row."""
-        table = np.asarray(joints, dtype=float)
-        _check(robot, table, seen, cameras, mounts, bases)
-        names, rows = list(seen), list[tuple[int, int, int, int]]()
-        pixels, points = list[Array](), list[Array]()
-        views: dict[tuple[int, int], list[tuple[int, PoseEstimate]]] = {}
-        for posture in range(len(table)):
-            for i, name in enumerate(names):
-                found, camera = seen[name][posture].corners, cameras[name].camera
-                for j, mount in enumerate(mounts.values()):
-                    estimate = estimate_pose([View(camera, np.eye(4), found)], mount.target)
-                    if estimate is not None:
-                        views.setdefault((i, j), []).append((posture, estimate))
-                    for number in found.keys() & mount.target.corners.keys():
-                        rows.append((posture, i, j, number))
-                        pixels.append(found[number])
-                        points.append(mount.target.corners[number])
-        for i, name in enumerate(names):
-            n = len({k for (at, _), those in views.items() if at == i for k, _ in those})
-            if n < LEAST_PICTURES:
+        cls, joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
+        cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
+    ) -> _Task:  # fmt: skip
+        """Put all corners in a row."""
+        tags = [
+            (k, i, j, found[k].corners)
+            for k in range(len(joints))
+            for i, found in enumerate(seen.values())
+            for j, mount in enumerate(mounts.values())
+            if found[k].corners.keys() & mount.target.corners.keys()
+        ]
+        lenses = [cameras[name].camera for name in seen]
+        targets = [mount.target for mount in mounts.values()]
+        rows = [
+            (k, i, j, number, corners[number], targets[j].corners[number])
+            for k, i, j, corners in tags
+            for number in corners.keys() & targets[j].corners.keys()
+        ]
+        for i, name in enumerate(seen):
+            if (n := len({k for k, at, *_ in tags if at == i})) < LEAST_PICTURES:
                 raise DataError(
-                    f"camera {name!r} sees tags of {list(mounts)} in {n} of {len(table)} "
+                    f"camera {name!r} sees tags of {list(mounts)} in {n} of {len(joints)} "
                     f"pictures, {LEAST_PICTURES} are needed: is it the camera that sees them, "
                     "are their numbers right, and are they large enough in the picture (20 "
                     "pixels an edge)?"
                 )
-        if lost := [name for j, name in enumerate(mounts) if j not in {j for _, j in views}]:
+        if lost := [name for j, name in enumerate(mounts) if j not in {one[2] for one in tags}]:
             raise DataError(f"no camera sees tags of {lost}: are their numbers right?")
-        corners = Corners(
-            np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(rows), 4, 0).T
-        )
-        carriers = [cameras[name].link for name in names]
-        carriers += [mount.link for mount in mounts.values()]
-        own = [{link for link in robot.links if link.startswith(base)} for base in bases]
-        problem = Reprojection(
-            robot, table, corners, [cameras[name].camera for name in names], carriers, own
-        )
-        poses = {}
-        for pair, those in views.items():
+        views = dict[tuple[int, int], tuple[Integers, Array]]()
+        for pair in dict.fromkeys((i, j) for _, i, j, _ in tags):
+            all_of = [
+                (k, estimate_pose([View(lenses[i], np.eye(4), corners)], targets[j]))
+                for k, i, j, corners in tags
+                if (i, j) == pair
+            ]
+            found = [(k, one) for k, one in all_of if one is not None]
             # those that cannot be trusted only where there are no others
-            good = [one for one in those if one[1].valid]
-            good = good if len(good) >= LEAST_PICTURES else those
-            poses[pair] = np.array([k for k, _ in good]), np.array([e.pose for _, e in good])
-        return cls(problem, names, list(mounts), bases, poses)
+            good = [(k, one) for k, one in found if one.valid]
+            found = good if len(good) >= LEAST_PICTURES else found
+            views[pair] = np.array([k for k, _ in found]), np.array([e.pose for _, e in found])
+        *places, pixels, points = zip(*rows, strict=True)
+        corners = Corners(
+            np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(places), 4, 1)
+        )
+        carriers = [cameras[name].link for name in seen] + [one.link for one in mounts.values()]
+        own = [{link for link in robot.links if link.startswith(base)} for base in bases]
+        problem = Reprojection(robot, joints, corners, lenses, carriers, own)
+        return cls(problem, list(seen), list(mounts), bases, views)
 
     def start(self) -> Array:
         """The state by closed forms, pair by pair of a camera and a target."""
         problem, n, known = self.problem, len(self.cameras), dict[int, Array]()
         bases = np.tile(np.eye(4), (len(self.bases), 1, 1))
-        links, _ = problem.placed(problem.state(np.tile(np.eye(4), (problem.n_poses, 1, 1))))
-        unplaced = set(range(len(bases)))
+        links, unplaced = problem.placed(problem.nothing)[0], set(range(len(bases)))
 
         def order(pair: tuple[int, int]) -> tuple[bool, bool, int]:
-            i, j = pair
-            base = problem.base_of[problem.links[n + j]]
-            one = (i in known) != (n + j in known)
-            return base in unplaced, not one, -len(self.views[pair][0])
+            i, target = pair[0], n + pair[1]
+            unknown = problem.base_of[problem.links[target]] in unplaced
+            return unknown, (i in known) == (target in known), -len(self.views[pair][0])
 
         while left := [(i, j) for i, j in self.views if not {i, n + j} <= known.keys()]:
             i, j = min(left, key=order)
             target, (postures, poses) = n + j, self.views[i, j]
             base = problem.base_of[problem.links[target]]
             camera, hand = links[postures][:, problem.links[[i, target]]].swapaxes(0, 1)
-            hand_from_camera = inverse(hand) @ camera
+            hand_from_carrier = inverse(hand) @ camera
             if base in unplaced and i in known:
-                there, known[target] = self._closed_form(i, j, hand_from_camera, poses)
+                there, known[target] = self._closed_form(i, j, hand_from_carrier, poses)
                 bases[base] = known[i] @ inverse(there)
                 own = problem.base_of == base
                 links[:, own] = bases[base] @ links[:, own]
                 unplaced.remove(base)
             elif i in known:
-                known[target] = mean_pose(hand_from_camera @ known[i] @ poses)[0]
+                known[target] = mean_pose(hand_from_carrier @ known[i] @ poses)[0]
             elif target in known:
-                back = inverse(hand_from_camera)
-                known[i] = mean_pose(back @ known[target] @ inverse(poses))[0]
+                back = inverse(hand_from_carrier) @ known[target]
+                known[i] = mean_pose(back @ inverse(poses))[0]
             else:
-                known[i], known[target] = self._closed_form(i, j, hand_from_camera, poses)
+                known[i], known[target] = self._closed_form(i, j, hand_from_carrier, poses)
         return problem.state(np.stack([*(known[part] for part in sorted(known)), *bases]))
 
     def _closed_form(
         self, i: int, j: int, hand_from_carrier: Array, camera_from_target: Array
     ) -> tuple[Array, Array]:
         """Poses of a camera in its carrier, and of a target in the hand."""
-        best, found = np.inf, None
+        found = list[tuple[float, Array, Array]]()
+        pairs = [one[:, :3, columns] for one in (hand_from_carrier, camera_from_target)
+                 for columns in (slice(3), 3)]  # fmt: skip
         for method in CLOSED_FORMS:
-            try:
-                turn, place = cv2.calibrateHandEye(
-                    hand_from_carrier[:, :3, :3], hand_from_carrier[:, :3, 3],
-                    camera_from_target[:, :3, :3], camera_from_target[:, :3, 3], method=method,
-                )  # fmt: skip
-            except cv2.error:
-                continue
-            camera = rigid(turn, place) if np.isfinite(turn).all() else np.eye(4)
-            poses = hand_from_carrier @ camera @ camera_from_target
-            target, _ = mean_pose(poses)
-            error = float(np.median(np.linalg.norm(poses[:, :3, 3] - target[:3, 3], axis=1)))
-            if np.isfinite(place).all() and error < best:
-                best, found = error, (camera, target)
-        if found is None:
-            raise DataError(
-                f"{self._missing(len(self.cameras) + j)} (camera {self.cameras[i]!r}, tags {self.mounts[j]!r})"
-            )
-        return found
+            with suppress(cv2.error):
+                turn, place = cv2.calibrateHandEye(*pairs, method=method)
+                if np.isfinite(place).all() and np.linalg.det(turn) > 0.5:
+                    poses = hand_from_carrier @ rigid(turn, place) @ camera_from_target
+                    target, _ = mean_pose(poses)
+                    away = np.linalg.norm(poses[:, :3, 3] - target[:3, 3], axis=1)
+                    found.append((float(np.median(away)), rigid(turn, place), target))
+        if not found:
+            raise DataError(f"{self._missing(i, j)}: no closed form has a solution")
+        return min(found, key=lambda one: one[0])[1:]
 
     def check_steady(self, fit: Adjustment) -> None:
         """Refuse a camera, or tags in a hand, that moved on the way."""
         problem, names = fit.problem, [*self.cameras, *self.mounts]
         q, _ = np.linalg.qr(fit.jacobian)
         postures = np.repeat(problem.corners.posture, 2)
-        places, column = np.unique(postures)[2:-1], np.cumsum(problem.free) - 1
-        found = []
+        column, found = np.cumsum(problem.free) - 1, []
         for part in range(len(problem.carriers)):
-            own, gains = fit.jacobian[:, column[6 * part : 6 * part + 6]], []
-            for at in places:
-                late = np.zeros_like(own)
-                late[: len(postures)] = own[: len(postures)] * (postures >= at)[:, None]
+            own, gains = fit.jacobian[: len(postures), column[6 * part :][:6]], {}
+            for at in np.unique(postures)[2:-1]:
+                late = np.zeros((len(fit.left), 6))
+                late[: len(postures)] = own * (postures >= at)[:, None]
                 late -= q @ (q.T @ late)
                 step = np.linalg.lstsq(late, fit.left, rcond=1e-9)[0]
-                gains.append(float(fit.left @ late @ step))
-            at = int(places[int(np.argmax(gains))])
-            other, state, new = _divided(fit, part, at)
-            moved = adjust(other, state)
-            before, after = other.split(moved.state)[0][[part + (new < part), new]]
-            gain = fit.surprise - moved.surprise
-            found.append((gain, part, at, angle_between(before, after), before, after))
-        gain, part, at, turned, before, after = max(found, key=lambda one: one[0])
-        moved_by = float(np.linalg.norm(before[:3, 3] - after[:3, 3]))
+                gains[int(at)] = float(fit.left @ late @ step)
+            at = max(gains, key=lambda at: gains[at])
+            moved, new = _divided(fit, part, at)
+            before, after = moved.problem.split(moved.state)[0][[part + (new < part), new]]
+            found.append((fit.surprise - moved.surprise, part, at, inverse(before) @ after))
+        gain, part, at, step = max(found, key=lambda one: one[0])
+        moved_by, turned = np.linalg.norm(step[:3, 3]), angle_between(np.eye(4), step)
         if gain > STEP_EVIDENCE and (moved_by > LEAST_STEP[0] or turned > LEAST_STEP[1]):
-            kind = "camera" if part < len(self.cameras) else "target"
             raise DataError(
-                f"{kind} {names[part]!r} was moved by {1e3 * moved_by:.0f} mm and "
-                f"{np.degrees(turned):.1f} deg at picture {at} of {len(problem.joints)}: fix it, "
-                "and record all pictures again, or take only those before or after"
+                f"{'camera' if part < len(self.cameras) else 'target'} {names[part]!r} was moved "
+                f"by {1e3 * moved_by:.0f} mm and {np.degrees(turned):.1f} deg at picture {at} of "
+                f"{len(problem.joints)}: fix it, and record all pictures again"
             )
 
     def check_known(self, fit: Adjustment) -> None:
         """Refuse postures that do not tell the error between object and hand elsewhere."""
-        problem, n = fit.problem, len(self.cameras)
-        rng = np.random.default_rng(0)
-        middle, reach = problem.joints.mean(0), LIKELY_REACH * np.ones(problem.robot.n_joints)
-        joints = middle + rng.uniform(-reach, reach, (ELSEWHERE, len(reach)))
-        pairs = np.array(list(self.views)).repeat(ELSEWHERE, 0).T
-        at = np.tile(np.arange(ELSEWHERE), len(self.views))
+        problem, pairs = fit.problem, list(self.views)
+        shape = ELSEWHERE, problem.robot.n_joints
+        away = np.random.default_rng(0).uniform(-LIKELY_REACH, LIKELY_REACH, shape)
+        at, nothing = np.tile(np.arange(ELSEWHERE), len(pairs)), np.zeros((3, 1))
         nothing = np.zeros((len(at), 3))
-        corners = Corners(nothing[:, :2], nothing, at, pairs[0], pairs[1], at)
-        _, _, seen = replace(problem, joints=joints, corners=corners).expected(fit.state)
+        corners = Corners(nothing[:, :2], nothing, at, *np.repeat(pairs, ELSEWHERE, 0).T, at)
+        other = replace(problem, joints=problem.joints.mean(0) + away, corners=corners)
+        _, _, seen = other.expected(fit.state)
         errors = np.einsum("nij,jk,nik->n", seen, fit.covariance(), seen) ** 0.5
-        expected = np.median(errors.reshape(len(self.views), -1), axis=1)
+        expected = np.median(errors.reshape(len(pairs), -1), axis=1)
         if (worst := float(expected.max())) > LARGEST_EXPECTED:
-            i, j = list(self.views)[int(expected.argmax())]
             raise DataError(
-                f"{self._missing(n + j)}: elsewhere the error between what is in the hand and "
-                f"what camera {self.cameras[i]!r} sees may be {1e3 * min(worst, 1):.0f} mm"
+                f"{self._missing(*pairs[int(expected.argmax())])}: elsewhere what the hand holds "
+                f"may be {1e3 * worst:.0f} mm from where it is seen"
             )
 
-    def _missing(self, part: int) -> str:
+    def _missing(self, i: int, j: int) -> str:
         """What postures lack."""
-        problem = self.problem
-        links, jacobians = problem.placed(problem.state(np.tile(np.eye(4), (problem.n_poses, 1, 1))))
-        used = np.unique(problem.corners.posture)
-        turns = Rotation.from_matrix(links[used, problem.links[part], :3, :3])
+        problem, part = self.problem, self.problem.links[len(self.cameras) + j]
+        links, jacobians = problem.placed(problem.nothing)
+        used = self.views[i, j][0]
+        turns = Rotation.from_matrix(links[used, part, :3, :3])
         vectors = (turns * turns.mean().inv()).as_rotvec()
         spreads, axes = np.linalg.eigh(vectors.T @ vectors / len(used))
         lacking = [
-            "the vertical" if abs(axis[2]) > 0.8 else f"({', '.join(f'{x:.1f}' for x in axis)})"
-            for spread, axis in zip(spreads, axes.T, strict=True)
-            if np.sqrt(max(spread, 0)) < HARDLY / 2
+            "the vertical" if abs(axis[2]) > 0.8 else f"the axis {axis.round(1).tolist()}"
+            for axis in axes.T[spreads < (HARDLY / 2) ** 2]
         ]
-        moved = np.degrees(np.ptp(problem.joints[used], axis=0))
-        movers = np.abs(jacobians[:, problem.links[part]]).max((0, 1)) > 1e-9
-        still = [
-            f"{name} ({moved[k]:.0f} deg)"
-            for k, name in enumerate(problem.robot.joint_names)
-            if movers[k] and moved[k] < np.degrees(HARDLY)
-        ]
-        text = f"{len(used)} postures are too few or too similar"
-        if lacking:
-            text += f", there is no rotation of the hand about {' and '.join(lacking)}"
-        return f"{text}: " + (
-            f"turn {', '.join(still)} by 45 deg and more"
-            if still
-            else "take 30, in which all joints differ by 45 deg and more"
-        )
+        moved = np.ptp(problem.joints[used], axis=0)
+        movers = (np.abs(jacobians[:, part]).max((0, 1)) > 1e-9) & (moved < HARDLY)
+        still = [f"{problem.robot.joint_names[k]} ({np.degrees(moved[k]):.0f} deg)"
+                 for k in np.flatnonzero(movers)]  # fmt: skip
+        return (
+            f"{len(used)} postures of {self.mounts[j]!r} before {self.cameras[i]!r} are too few "
+            "or too similar"
+            + (f", without rotation about {' and '.join(lacking)}" if lacking else "")
+            + (f"; turn {', '.join(still)} by 45 deg and more" if still
+               else "; take 30, in which all joints differ by 45 deg and more")
+        )  # fmt: skip
 
     def scales(self, fit: Adjustment) -> tuple[str, ...]:
         """Whether another focal length or size of tags explains clearly more, and which."""
-        problem = fit.problem
-        gains, values, errors = [], [], []
-        for number in range(len(self.cameras) + 1):
-            free = problem.free.copy()
-            free[problem.scales.start + number] = True
-            other = adjust(replace(problem, free=free), fit.state)
-            gains.append(fit.surprise - other.surprise)
-            values.append(100 * other.problem.split(other.state)[2][number])
-            errors.append(100 * other.covariance()[problem.scales, problem.scales][number, number] ** 0.5)
-        best = max(gains)
-        if best < SCALE_EVIDENCE:
-            return ()
-        texts = [
-            f"the focal length of camera {name!r} is {abs(value):.1f} +- {error:.1f} % too "
-            f"{'small' if value > 0 else 'large'} (tpgmm calibrate camera; are its pictures "
-            "those that it was calibrated with, not cropped or scaled?)"
-            for name, value, error in zip(self.cameras, values, errors, strict=False)
-        ]
-        texts.append(
-            f"tags are {abs(values[-1]):.1f} +- {errors[-1]:.1f} % {'larger' if values[-1] > 0 else 'smaller'} "
-            "than the cell says (measure one with a ruler)"
-        )
-        return (" or ".join(t for t, gain in zip(texts, gains, strict=True) if best - gain < SCALE_EVIDENCE / 2),)
+        found = list[tuple[float, str]]()
+        for number, at in enumerate(range(fit.problem.n_steps)[fit.problem.scales]):
+            free = fit.problem.free.copy()
+            free[at] = True
+            other = adjust(replace(fit.problem, free=free), fit.state)
+            value = 100 * other.problem.split(other.state)[2][number]
+            amount = f"{abs(value):.1f} +- {100 * other.covariance()[at, at] ** 0.5:.1f} %"
+            text = (
+                f"tags are {amount} {'larger' if value > 0 else 'smaller'} than said: measure "
+                "one with a ruler"
+                if number == len(self.cameras)
+                else f"the focal length of camera {self.cameras[number]!r} is {amount} too "
+                f"{'small' if value > 0 else 'large'}: calibrate it again, by pictures that are "
+                "not cropped or scaled"
+            )
+            found.append((fit.surprise - other.surprise, text))
+        best = max(found)[0]
+        likely = [text for gain, text in found if best - gain < SCALE_EVIDENCE / 2]
+        return (" or ".join(likely),) if best > SCALE_EVIDENCE else ()
 
-    def result(self, fit: Adjustment, unknown: NDArray[np.bool_], problems: tuple[str, ...]) -> CellCalibration:
+    def result(
+        self, fit: Adjustment, unknown: NDArray[np.bool_], problems: tuple[str, ...]
+    ) -> CellCalibration:
         """The calibration, with errors on pictures left out."""
-        problem, n = fit.problem, len(self.cameras)
-        used, far, turned = problem.corners.posture, list[float](), list[float]()
+        problem, n, away = fit.problem, len(self.cameras), list[Array]()
         for fold in range(FOLDS):
-            kept = used % FOLDS != fold
-            part = adjust(replace(problem, corners=problem.corners.of(kept)), fit.state, fit.noise)
+            corners = problem.corners.of(problem.corners.posture % FOLDS != fold)
+            part = adjust(replace(problem, corners=corners), fit.state, fit.noise)
             placed = problem.carried(part.state)
             for (i, j), (postures, poses) in self.views.items():
-                for k, pose in zip(postures, poses, strict=True):
-                    if k % FOLDS == fold:
-                        away = inverse(placed[k, i] @ pose) @ placed[k, n + j]
-                        far.append(float(np.linalg.norm(away[:3, 3])))
-                        turned.append(angle_between(np.eye(4), away))
+                own = postures[left := postures % FOLDS == fold]
+                away += [*(inverse(placed[own, i] @ poses[left]) @ placed[own, n + j])]
         poses, offsets, _ = problem.split(fit.state)
-        names, spread = problem.robot.joint_names, np.sqrt(np.diag(fit.covariance()))[problem.offsets]
-        moving = self.problem.free[problem.offsets]
-        pixels, _, _ = self.problem.expected(fit.state)
-        expected: dict[str, list[dict[int, Array]]] = {
-            name: [{} for _ in problem.joints] for name in self.cameras
-        }
-        c = self.problem.corners
-        for first in range(0, len(pixels), 4):
-            expected[self.cameras[c.camera[first]]][c.posture[first]][int(c.number[first])] = pixels[first : first + 4]
+        spread = np.diag(fit.covariance())[problem.offsets] ** 0.5
+        joints = list(zip(problem.robot.joint_names, self.problem.free[problem.offsets],
+                          offsets.tolist(), spread.tolist(), unknown, strict=True))  # fmt: skip
+        (pixels, *_), c = self.problem.expected(fit.state), self.problem.corners
+        expected = defaultdict[tuple[str, int], dict[int, Array]](dict)
+        for k in range(0, len(pixels), 4):
+            place = self.cameras[c.camera[k]], int(c.posture[k])
+            expected[place][int(c.number[k])] = pixels[k : k + 4]
         return CellCalibration(
             dict(zip(self.cameras, poses[:n], strict=True)),
             dict(zip(self.mounts, poses[n:], strict=False)),
             dict(zip(self.bases, poses[len(problem.carriers) :], strict=True)),
-            {name: float(offsets[k]) for k, name in enumerate(names) if moving[k]},
-            {name: float(spread[k]) for k, name in enumerate(names) if moving[k]},
-            tuple(name for k, name in enumerate(names) if unknown[k]),
-            np.array(far), np.array(turned), fit.noise.joints, problems, expected,
+            {name: value for name, moves, value, _, _ in joints if moves},
+            {name: error for name, moves, _, error, _ in joints if moves},
+            tuple(name for name, *_, one in joints if one),
+            np.linalg.norm(np.array(away)[:, :3, 3], axis=1),
+            Rotation.from_matrix(np.array(away)[:, :3, :3]).magnitude(),
+            fit.noise.joints, problems, expected,
         )  # fmt: skip
 
 
-def _divided(fit: Adjustment, part: int, at: int) -> tuple[Reprojection, Array, int]:
-    """The problem with one part as two, before and after a posture; and where the new one is."""
+def _divided(fit: Adjustment, part: int, at: int) -> tuple[Adjustment, int]:
+    """A fit with one part as two, before and after a posture; and which part is the later."""
     problem, n = fit.problem, len(fit.problem.cameras)
+    kind, number, new = (
+        ("camera", part, n) if part < n else ("target", part - n, len(problem.carriers))
+    )
     corners, cameras, carriers = problem.corners, list(problem.cameras), list(problem.carriers)
     poses, offsets, _ = problem.split(fit.state)
-    late, new = corners.posture >= at, n if part < n else len(carriers)
-    if part < n:
-        cameras.append(cameras[part])
-        corners = replace(corners, camera=np.where(late & (corners.camera == part), n, corners.camera))
-    else:
-        corners = replace(corners, target=np.where(late & (corners.target == part - n), new - n, corners.target))
+    late = (corners.posture >= at) & (getattr(corners, kind) == number)
+    index = np.where(late, new if part < n else new - n, getattr(corners, kind))
+    cameras += cameras[part:][:1] if part < n else []
     carriers.insert(new, carriers[part])
-    free = np.zeros(0, dtype=bool)
-    other = replace(problem, corners=corners, cameras=cameras, carriers=carriers, free=free)
+    other = replace(
+        problem, corners=replace(corners, **{kind: index}), cameras=cameras, carriers=carriers,
+        free=np.zeros(0, dtype=bool),
+    )  # fmt: skip
     state = other.state(np.insert(poses, new, poses[part], axis=0))
     other.split(state)[1][:] = offsets
-    return other, state, new
+    return adjust(other, state), new
 
 
 def _check(
-    robot: Kinematics,
-    joints: Array,
-    seen: Mapping[str, Sequence[Detections]],
-    cameras: Mapping[str, CellCamera],
-    mounts: Mapping[str, Mount],
-    bases: Sequence[str],
-) -> None:
+    joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
+    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
+) -> None:  # fmt: skip
     """Refuse what does not go together."""
     if joints.shape[1:] != (robot.n_joints,) or not np.isfinite(joints).all():
-        raise DataError(
-            f"joints are finite and of shape (n, {robot.n_joints}), those of "
-            f"{list(robot.joint_names)}; got {joints.shape}"
-        )
-    if not seen or not mounts:
-        raise DataError("a cell is calibrated by one camera and one target at least")
+        names = list(robot.joint_names)
+        raise DataError(f"joints are finite, of shape (n, {len(names)}), those of {names}; got "
+                        f"{joints.shape}")  # fmt: skip
     for name, found in seen.items():
         if name not in cameras:
             raise UnknownNameError("camera", name, "the cell", cameras)
         if len(found) != len(joints):
             raise DataError(f"camera {name!r} has {len(found)} pictures for {len(joints)} rows")
         for posture, one in enumerate(found):
-            if twice := sorted(one.twice):
-                raise DataError(
-                    f"camera {name!r} sees tags {twice} twice in picture {posture}: each number "
-                    "may be there once; cover or remove the others"
-                )
+            if one.twice:
+                raise DataError(f"camera {name!r} sees tags {sorted(one.twice)} twice in picture "
+                                f"{posture}: cover or remove the others")  # fmt: skip
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")
     links = [cameras[name].link for name in seen] + [mount.link for mount in mounts.values()]
-    for link in links:
-        if link is not None and link not in robot.links:
-            raise UnknownNameError("link", link, "the robot", robot.links)
-    if all(link is None for link in links):
+    for link in {*links} - {None}:
+        if link not in robot.links:
+            raise UnknownNameError("link", str(link), "the robot", robot.links)
+    if not seen or not mounts or not any(links):
         raise DataError("no camera and no target is on a link of the robot: nothing moves")
     for base in bases:
-        own = [link for link in robot.links if link.startswith(base)]
-        if not own or len(own) == len(robot.links):
+        if len({link.startswith(base) for link in robot.links}) < 2:
             raise DataError(f"links of an arm begin with {base!r}, not all; got {robot.links}")

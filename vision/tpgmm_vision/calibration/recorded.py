@@ -25,6 +25,8 @@ FRAMES, POSTURES = 200, 60
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
 SLOW = 0.2
+#: Joints nearer to one another are the same posture [rad].
+SAME = np.radians(2.0)
 
 
 def board_pictures(source: Path) -> dict[str, NDArray[np.uint8]]:
@@ -111,7 +113,7 @@ def slow_postures(
 def spread(points: Array, most: int) -> NDArray[np.int_]:
     """Indices, in ascending order, of points (n, d) that are far from one another."""
     chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < min(most, len(points)):
+    while len(chosen) < most and distance.max() > SAME:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.unique(chosen)

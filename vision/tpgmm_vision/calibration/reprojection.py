@@ -93,8 +93,7 @@ class Reprojection:
         if not len(self.free):
             free = np.ones(self.n_steps, dtype=bool)
             object.__setattr__(self, "free", free)
-            still = self.state(np.tile(np.eye(4), (self.n_poses, 1, 1)))
-            jacobians = np.abs(self.placed(still)[1][:, self.links])
+            jacobians = np.abs(self.placed(self.nothing)[1][:, self.links])
             free[self.offsets], free[self.scales] = jacobians.max((0, 1, 2)) > 1e-9, False
 
     @property
@@ -120,6 +119,11 @@ class Reprojection:
     def state(self, poses: Array) -> Array:
         """The state of poses (n_poses, 4, 4), without offsets and scales."""
         return np.concatenate((poses.ravel(), np.zeros(self.n_steps - 6 * self.n_poses)))
+
+    @property
+    def nothing(self) -> Array:
+        """The state of poses that move nothing."""
+        return self.state(np.tile(np.eye(4), (self.n_poses, 1, 1)))
 
     def split(self, state: Array) -> tuple[Array, Array, Array]:
         """Poses (n_poses, 4, 4), offsets (n_joints,) and scales of a state."""
@@ -148,9 +152,12 @@ class Reprojection:
         joints = (self.joints if joints is None else joints) + offsets
         found = self.robot.state(torch.as_tensor(joints))
         values = torch.cat((found.positions, found.orientations), -1).numpy()
-        values = np.concatenate((values, np.tile([0, 0, 0, 1.0, 0, 0, 0], (len(values), 1, 1))), 1)
-        links, jacobians = pose_matrix(values), np.pad(
-            found.jacobians.numpy(), ((0, 0), (0, 1), (0, 0), (0, 0))
+        values = np.concatenate(
+            (values, np.tile([0, 0, 0, 1.0, 0, 0, 0], (len(values), 1, 1))), 1
+        )
+        links, jacobians = (
+            pose_matrix(values),
+            np.pad(found.jacobians.numpy(), ((0, 0), (0, 1), (0, 0), (0, 0))),
         )
         for number, base in enumerate(poses[len(self.carriers) :]):
             own, turn = self.base_of == number, block_diag(base[:3, :3], base[:3, :3])

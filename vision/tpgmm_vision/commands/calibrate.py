@@ -144,7 +144,9 @@ def cell(
     for name in camera or ():
         if name not in known.cameras:
             raise UnknownNameError("camera", name, "the cell", known.cameras)
-    cameras = {name: one for name, one in known.cameras.items() if name in (camera or known.cameras)}
+    cameras = {
+        name: one for name, one in known.cameras.items() if name in (camera or known.cameras)
+    }
     entries = {one.partition("=")[0]: _target(one) for one in [*(hand or ()), *(check or ())]}
     mounts = {name: Mount(target_from(entry, name), name if k < len(hand or ()) else None)
               for k, (name, entry) in enumerate(entries.items())}  # fmt: skip
@@ -170,7 +172,10 @@ def cell(
                 advance(k * len(images) + len(seen[name]), len(pictures) * len(images))
     result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
     for name, pose in result.cameras.items():
-        content["cameras"][name] |= {"pose": pose_content(pose), "report": str(result).splitlines()[0]}
+        content["cameras"][name] |= {
+            "pose": pose_content(pose),
+            "report": str(result).splitlines()[0],
+        }
     for name, mount in mounts.items():
         if mount.link is None:
             content.setdefault("checks", {})[name] = {
@@ -185,9 +190,13 @@ def cell(
     for name, images in pictures.items():
         for k, image in enumerate(images):
             file = out / f"{name}_{k:03}.jpg"
-            file.write_bytes(drawn(image, seen[name][k].corners, result.expected[name][k]))
+            file.write_bytes(
+                drawn(image, seen[name][k].corners, result.expected.get((name, k), {}))
+            )
     write_cell(content, cell)
-    typer.echo(f"{', '.join(result.cameras)}: {len(np.unique(joints, axis=0))} postures; {result}")
+    typer.echo(
+        f"{', '.join(result.cameras)}: {len(np.unique(joints, axis=0))} postures; {result}"
+    )
     for prefix, moved in result.bases.items():
         typer.echo(f"base of {prefix}: move it by {pose_content(moved)} in the base frame")
     for problem in result.problems:
