@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT, KNOWN, SEEN
 from tpgmm_datasets.lerobot.episodes import read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, open_layout
@@ -72,6 +73,9 @@ class DatasetInfo:
         All tasks.
     lengths : tuple of int
         Rows of each episode, by the metadata.
+    tracked : mapping of str to (float, float)
+        Objects that were tracked in the pictures: in which share of all rows each was seen,
+        and was seen or inferred.
     problems : tuple of DatasetError
         All that is wrong; empty for a set that loads. What is wrong with the joints, and what
         is given may mend, has ``check="joints"``.
@@ -88,6 +92,7 @@ class DatasetInfo:
     events: tuple[str, ...]
     tasks: tuple[str, ...]
     lengths: tuple[int, ...]
+    tracked: Mapping[str, tuple[float, float]]
     problems: tuple[DatasetError, ...]
 
     @property
@@ -134,19 +139,27 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
         if key not in BOOKKEEPING and not feature.is_camera and feature.dtype != "string"
     ]
     ranges: dict[str, tuple[Any, Any]] = {}
+    counts: dict[str, Any] = {SEEN: 0, KNOWN: 0}
     for rows in read_episodes(layout, layout.episodes, features, problems.append):
         for key, values in rows.values.items():
             low, high = values.min(axis=0), values.max(axis=0)
             if key in ranges:
                 low, high = np.minimum(low, ranges[key][0]), np.maximum(high, ranges[key][1])
             ranges[key] = low, high
+            if key in counts:
+                counts[key] = counts[key] + values.sum(axis=0)
     joints = None
     try:
         joints = joint_feature(layout)
         names_of(layout.feature(joints), None, None)
     except DatasetError as problem:
         problems.append(problem)
-    environment = layout.features.get(ENVIRONMENT)
+    environment, rows_in_all = (
+        layout.features.get(ENVIRONMENT),
+        sum(episode.length for episode in layout.episodes),
+    )
+    shares = [np.ravel(count) / max(rows_in_all, 1) for count in counts.values()]
+    objects = layout.features[SEEN].names if SEEN in ranges and KNOWN in ranges else ()
     return DatasetInfo(
         layout.root,
         layout.version,
@@ -159,6 +172,10 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
         tuple(f.key.removeprefix(EVENT) for f in features if f.key.startswith(EVENT)),
         layout.tasks,
         tuple(episode.length for episode in layout.episodes),
+        {
+            name: (float(a), float(b))
+            for name, a, b in zip(objects or (), *shares, strict=False)
+        },
         tuple(problems),
     )
 

@@ -229,10 +229,11 @@ class _Problem:
         guesses = torch.rand(GUESSES, m, generator=generator, dtype=torch.float64)
         guesses = (2 * guesses.to(self.angles) - 1) * math.pi
         signs = choices.repeat_interleave(GUESSES, 0)
-        offsets, cost = self._descend(signs, guesses.repeat(len(choices), 1), ROUGH)
+        descend, tried = levenberg_marquardt, guesses.repeat(len(choices), 1)
+        offsets, cost = descend(lambda one: self._residual(signs, one), tried, ROUGH)
         first = cost.reshape(-1, GUESSES).argmin(-1, keepdim=True)
         offsets = offsets.reshape(-1, GUESSES, m).take_along_dim(first[..., None], 1)[:, 0]
-        return choices, *self._descend(choices, offsets, FINE)
+        return choices, *descend(lambda one: self._residual(choices, one), offsets, FINE)
 
     def errors(self, signs: Tensor, offsets: Tensor) -> Tensor:
         """Standard errors (m,): of the accuracy that was given, or of what is left if more."""
@@ -247,10 +248,6 @@ class _Problem:
         position, turn = parts.square().sum(-1).mean(0).sqrt().tolist()
         known = not math.isinf(self.orientation_std)
         return position * self.position_std, turn * self.orientation_std if known else math.nan
-
-    def _descend(self, signs: Tensor, offsets: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """The best offsets for all choices at once."""
-        return levenberg_marquardt(lambda tried: self._residual(signs, tried), offsets, steps)
 
     def _residual(self, signs: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """What is left (S, 6 n) in units of its accuracy, and how offsets lessen it."""

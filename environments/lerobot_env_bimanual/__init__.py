@@ -96,9 +96,6 @@ class _ControlledEnvConfig(_StateEnvConfig):
     observe_objects: bool = True
 
     def __post_init__(self) -> None:
-        self._look()
-
-    def _look(self) -> None:
         """Make the features those of the cameras, and of what else is observed."""
         from lerobot_env_bimanual.eyes.views import chosen_views
 

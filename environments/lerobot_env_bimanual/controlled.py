@@ -22,7 +22,7 @@ from lerobot_env_bimanual.disturbances import (
     parse_condition,
 )
 from lerobot_env_bimanual.eyes.carriers import Carrier
-from lerobot_env_bimanual.eyes.lens import Imperfections, usual_camera
+from lerobot_env_bimanual.eyes.lens import usual_camera
 from lerobot_env_bimanual.eyes.rig import Rig, View
 from lerobot_env_bimanual.eyes.views import CHECK, VIEWS, chosen_views
 from lerobot_env_bimanual.robot_scene import CAMERA, RobotScene
@@ -91,6 +91,8 @@ class ControlledEnv(StateEnv):
     ----------
     joint_names : tuple of str
         The order of actions and of ``agent_pos``.
+    eyes : Rig or None
+        The cameras.
 
     Raises
     ------
@@ -98,10 +100,11 @@ class ControlledEnv(StateEnv):
         If an option is not one of the above.
     """
 
-    #: Units of joints, by which data sets are recorded; none are declared where it is empty.
-    units: ClassVar[Sequence[str] | None] = None
-    #: What LeRobot calls the robot; by default as the environment does.
+    #: How data sets are recorded: what LeRobot calls the robot, if not as the environment does;
+    #: what follows the names of joints; their units, empty to declare none.
     robot_type: ClassVar[str | None] = None
+    suffix: ClassVar[str] = ""
+    units: ClassVar[Sequence[str] | None] = None
     #: Where cameras are, by their names, and tags that stand still.
     views: ClassVar[Mapping[str, View]] = VIEWS
     checks: ClassVar[Mapping[str, Carrier]] = CHECK
@@ -157,23 +160,17 @@ class ControlledEnv(StateEnv):
         if observe_objects:
             observed["environment_state"] = spaces.Box(-reach, reach, dtype=np.float64)
         observed["timestamp"] = spaces.Box(0.0, 3 * steps / fps, (1,), dtype=np.float64)
-        self._rig = None
+        self.eyes = None
         if views := chosen_views(cameras):
-            shape, size = (camera_height, camera_width, 3), (camera_width, camera_height)
-            picture = spaces.Box(0, 255, shape, dtype=np.uint8)
+            picture = spaces.Box(0, 255, (camera_height, camera_width, 3), dtype=np.uint8)
             observed["pixels"] = spaces.Dict(dict.fromkeys(views, picture))
-            self._rig = self.rig(cameras, size)
+            self.eyes = self.rig(cameras, (camera_width, camera_height))
         self.observation_space = spaces.Dict(observed)
         self._live = track or any(part.live for part in self.disturbances)
         self._steps = steps  # no episode is going on
 
     def rig(
-        self,
-        cameras: str | Sequence[str],
-        size: tuple[int, int] = (640, 480),
-        imperfections: Imperfections | None = None,
-        carriers: Mapping[str, Carrier] | None = None,
-        objects: Mapping[str, str] | None = None,
+        self, cameras: str | Sequence[str], size: tuple[int, int] = (640, 480), **options: Any
     ) -> Rig:
         """Cameras before the scene, and tags on its objects and beside the table.
 
@@ -183,42 +180,25 @@ class ControlledEnv(StateEnv):
             As the option.
         size : (int, int)
             Width and height of their pictures.
-        imperfections : Imperfections, optional
-            What spoils them.
-        carriers, objects : mapping, optional
-            Other tags than those, as for :class:`~lerobot_env_bimanual.eyes.rig.Rig`.
+        **options
+            Of :class:`~lerobot_env_bimanual.eyes.rig.Rig`: other ``carriers``,
+            ``imperfections``.
         """
-        return Rig(
-            self._scene,
-            {name: self.views[name] for name in chosen_views(cameras)},
-            {**self.checks, **self.carriers} if carriers is None else carriers,
-            objects,
-            camera=usual_camera(*size),
-            imperfections=imperfections,
-        )
+        usual: dict[str, Any] = {
+            "carriers": {**self.checks, **self.carriers},
+            "camera": usual_camera(*size),
+        }
+        views = {name: self.views[name] for name in chosen_views(cameras)}
+        return Rig(self._scene, views, **usual | options)
 
-    @property
-    def recorded_names(self) -> list[str]:
-        """What the joints are called in data sets."""
-        return list(self.joint_names)
-
-    def cell(self, rig: Rig | None = None) -> dict[str, Any]:
-        """The true cell file of the environment with its cameras, or with those of a rig.
-
-        Raises
-        ------
-        DataError
-            If it has no cameras.
-        """
-        rig = rig or self._rig
-        if rig is None:
-            raise DataError("the environment has no cameras: make it with cameras='front'")
-        return {**rig.content(), "joints": list(self.joint_names)}
+    def cell_of_joints(self) -> dict[str, Any]:
+        """What a cell file says of the joints."""
+        return {"joints": list(self.joint_names)}
 
     def close(self) -> None:
         """Free what the graphics library holds."""
-        if self._rig is not None:
-            self._rig.close()
+        if self.eyes is not None:
+            self.eyes.close()
         super().close()
 
     def _check_options(self) -> None:
@@ -447,8 +427,8 @@ class ControlledEnv(StateEnv):
         seen: Observation = {"agent_pos": joints, "timestamp": np.array([self._time])}
         if self.observe_objects:
             seen["environment_state"] = shown.copy()
-        if self._rig is not None:
-            seen["pixels"] = self._rig.pictures(self._grain)
+        if self.eyes is not None:
+            seen["pixels"] = self.eyes.pictures(self._grain)
         return seen
 
     def _perceived(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 ``python -m lerobot_env_bimanual.record --task pour --n 10 --cameras front --out out/pour``
 writes a set with ``observation.state``, ``action``, the cameras' videos, and the true cell file
-beside them; the poses of the objects are in the pictures alone.
+in it; the poses of the objects are in the pictures alone.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,18 +21,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.base import Observation
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.eyes.calibration import (
-    calibration_episode,
-    chain_of,
-    varied_postures,
-)
+from lerobot_env_bimanual.eyes import calibration
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.eyes.lens import Imperfections
-from lerobot_env_bimanual.eyes.recorder import CODECS, Recorder
+from lerobot_env_bimanual.eyes.recorder import CODECS, recording, row
+from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
 from lerobot_env_bimanual.so101 import TASKS
@@ -46,15 +42,13 @@ from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
 from tpgmm_torch import Demonstration
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
-__all__ = ["CALIBRATION", "EXPERTS", "Expert", "expert", "main", "record", "record_calibration"]
+__all__ = ["CALIBRATION", "EXPERTS", "Expert", "expert", "main", "record"]
 
 Vector = NDArray[np.float64]
 #: Time steps per second of the experts' motions, whatever the rate of the set.
 RATE = 100.0
-#: The task of showing tags to the cameras, and by how much joints may be wrong then.
-CALIBRATION = "calibration"
-#: Tags in the hands that calibrate: the first number of each cube.
-IN_HAND = {"l_hand": 30, "r_hand": 40}
+#: The task of showing tags to the cameras, and the first tag of the cube in each hand.
+CALIBRATION, IN_HAND = "calibration", {"l_hand": 30, "r_hand": 40}
 #: Attempts for each episode that is asked for; experts fail seldom.
 ATTEMPTS = 3
 
@@ -72,27 +66,26 @@ class Expert:
     objects : tuple of str
         What is observed.
     actions : callable, optional
-        In place of motions: gives the actions in an episode that has begun, one by one.
+        In place of motions: the actions in an episode that has begun, one by one.
     """
 
     environment: Callable[..., ControlledEnv]
     motion: Callable[[int], Demonstration] | None
     objects: tuple[str, ...]
-    actions: Callable[[Any, np.random.Generator], Iterator[Vector]] | None = None
+    actions: Callable[[Any, np.random.Generator], Iterable[Vector]] | None = None
 
     def begin(
         self, env: ControlledEnv, rng: np.random.Generator
-    ) -> tuple[Observation, Iterable[Vector]]:
-        """Begin an episode; what is observed, and the actions."""
-        if self.motion is None:
+    ) -> tuple[dict[str, Any], Iterable[Vector]]:
+        """Begin an episode: what is observed, and the actions."""
+        motion = self.motion(int(rng.integers(2**31))) if self.motion else None
+        start, seed = {} if motion is None else self.start(motion), int(rng.integers(2**31))
+        observation, _ = env.reset(seed=seed, options=start)
+        if motion is None:
             assert self.actions is not None
-            observation, _ = env.reset(seed=int(rng.integers(2**31)))
             return observation, self.actions(env, rng)
-        motion = self.motion(int(rng.integers(2**31)))
-        seed = int(rng.integers(2**31))
-        observation, _ = env.reset(seed=seed, options=self.start(motion))
-        ticks = np.arange(1, int(motion.time[-1] * env.fps + 1e-6) + 2) / env.fps
         time = motion.time.numpy()
+        ticks = np.arange(1, int(time[-1] * env.fps + 1e-6) + 2) / env.fps
         ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
         return observation, np.stack(ways, axis=1)
 
@@ -109,25 +102,19 @@ class Expert:
 
 
 def expert(task: str, robot: str = UPPER_BODY) -> Expert:
-    """The expert of a task by its name.
+    """The expert of a task by its name, and that of the robot.
 
     Raises
     ------
-    UnknownNameError
+    DataError, UnknownNameError
         If there is none.
     """
+    if task not in EXPERTS:
+        raise UnknownNameError("task", task, "the recorder", EXPERTS)
     if task in SUITE:
         able = suite_task(task, robot)
-
-        def drawn(seed: int) -> Demonstration:
-            return able.demonstrations(1, seed, RATE)[0]
-
-        def made(**options: Any) -> ControlledEnv:
-            return SuiteEnv(task, robot, **options)
-
-        return Expert(made, drawn, able.objects)
-    if task not in ALONE:
-        raise UnknownNameError("task", task, "the recorder", EXPERTS)
+        made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
+        return Expert(made, lambda seed: of(1, seed)[0], able.objects)
     if robot != UPPER_BODY:
         raise DataError(f"{task} is done by its own robot alone, not by {robot!r}")
     return ALONE[task]
@@ -160,10 +147,13 @@ def record(
     fps: int = 25,
     size: tuple[int, int] = (640, 480),
     robot: str = UPPER_BODY,
-    true_poses: bool = False,
     codec: str = "av1",
-    noise: float = 0.0,
     imperfections: Imperfections | None = None,
+    true_poses: bool = False,
+    noise: float = 0.0,
+    hand: str = "r_hand",
+    offset_deg: float = 0.0,
+    noise_deg: float = 0.0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Let an environment follow the expert's motions, and record what its cameras see.
@@ -171,14 +161,17 @@ def record(
     ``observation.state`` is what was measured, ``action`` the reference for the end of each
     period. Demonstrations that do not succeed by the rules of the environment are not kept.
 
+    ``"calibration"`` is no task: the robot shows a cube of tags in its hand to the first camera
+    in varied postures, in one episode.
+
     Parameters
     ----------
     task : str
-        One of :data:`EXPERTS`.
+        One of :data:`EXPERTS`, or ``"calibration"``.
     out : str or Path
         The folder; it must not exist.
     n : int, default=10
-        How many episodes.
+        How many episodes, or postures.
     seed : int, default=0
         Of the demonstrations and of all noise.
     cameras : str or sequence of str, default="front"
@@ -188,94 +181,22 @@ def record(
     size : (int, int)
         Width and height of the pictures.
     robot : str, default="upper_body"
-        Who does a task of the suite.
-    true_poses : bool, default=False
-        Whether the poses of the objects are recorded too, in ``observation.environment_state``.
+        Who does a task of the suite, or is calibrated.
     codec : {"av1", "h264", "pictures"}, default="av1"
-    noise : float, default=0
-        Of the sensors, as of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`.
     imperfections : Imperfections, optional
         What spoils the pictures.
+    true_poses : bool, default=False
+        Whether the poses of the objects are recorded too, in ``observation.environment_state``.
+    noise : float, default=0
+        Of the sensors, as of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`.
+    hand : {"r_hand", "l_hand"}, default="r_hand"
+        That has the tags in a calibration.
+    offset_deg, noise_deg : float, default=0
+        Standard deviations of constant errors of the joints that move this hand, and of the
+        noise of each reading, in a calibration [deg]. The constant ones are ``joint_offsets``
+        of the cell file.
     progress : callable, optional
         Is given a line after each episode.
-
-    Returns
-    -------
-    Path
-        The folder, with ``cell.json`` in it.
-
-    Raises
-    ------
-    DataError, UnknownNameError
-        If the folder exists, an option is not one of the above, or so many do not succeed.
-    """
-    if n < 1:
-        raise DataError(f"at least one episode is recorded, got n={n}")
-    able = expert(task, robot)
-    env = able.environment(fps=fps, noise=noise)
-    rig = env.rig(cameras, size, imperfections)
-    if not rig.views:
-        raise DataError("a set with videos needs a camera: --cameras front")
-    env.reset(seed=seed)  # the table stands somewhere
-    recorder = Recorder(
-        out,
-        fps,
-        env.recorded_names,
-        dict.fromkeys(rig.views, size),
-        env.cell(rig),
-        objects=able.objects if true_poses else (),
-        units=env.units,
-        robot_type=env.robot_type or robot,
-        codec=codec,
-    )
-    with recorder:
-        for number in range(ATTEMPTS * n):
-            # each has numbers of its own: episode 3 is the same, however many there are
-            rng = np.random.default_rng((seed, number))
-            done, seconds = _follow(recorder, env, rig, able, rng, true_poses)
-            progress(
-                f"episode {recorder.episodes} of {n}, {seconds:.1f} s"
-                + ("" if done else ": one more failed, and was not kept")
-            )
-            if recorder.episodes == n:
-                break
-        else:
-            raise DataError(
-                f"of {ATTEMPTS * n} demonstrations of {task} {recorder.episodes} succeed, "
-                f"{n} are asked for"
-            )
-    rig.close()
-    env.close()
-    return Path(out)
-
-
-def record_calibration(
-    out: str | Path,
-    *,
-    n: int = 30,
-    seed: int = 0,
-    cameras: str | Sequence[str] = "front",
-    fps: int = 25,
-    size: tuple[int, int] = (640, 480),
-    robot: str = UPPER_BODY,
-    hand: str = "r_hand",
-    codec: str = "av1",
-    offset_deg: float = 0.0,
-    noise_deg: float = 0.0,
-    imperfections: Imperfections | None = None,
-) -> Path:
-    """Let a robot of the suite show a cube of tags in its hand in varied postures.
-
-    Parameters
-    ----------
-    out, seed, cameras, fps, size, robot, codec, imperfections
-        As for :func:`record`; the postures are such that the first camera sees the tags.
-    n : int, default=30
-        How many postures.
-    hand : {"r_hand", "l_hand"}, default="r_hand"
-    offset_deg, noise_deg : float, default=0
-        Standard deviations of constant errors of the joints that move the hand, and of the
-        noise of each reading [deg]. The constant ones are ``joint_offsets`` of the cell file.
 
     Returns
     -------
@@ -285,65 +206,89 @@ def record_calibration(
     Raises
     ------
     DataError, UnknownNameError
-        If the folder exists, an option is not one of the above, or so few postures show the
-        tags.
+        If the folder exists, an option is not one of the above, so many demonstrations do not
+        succeed, or so few postures show the tags.
     """
+    if n < 1:
+        raise DataError(f"at least one episode is recorded, got n={n}")
+    shows, rng = task == CALIBRATION, np.random.default_rng(seed)
     if hand not in HANDS:
         raise UnknownNameError("hand", hand, "the recorder", HANDS)
-    env = expert("lid", robot).environment(fps=fps)
+    able = expert("lid" if shows else task, robot)
+    env = able.environment(fps=fps, noise=noise)
+    names, offsets, options = env.joint_names, np.zeros(len(env.joint_names)), dict[str, Any]()
+    if shows:
+        side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
+        cube = cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)
+        options = {"carriers": {**CHECK, hand: cube}, "objects": {}}
+    rig = env.rig(cameras, size, imperfections=imperfections, **options)
+    if not rig.views:
+        raise DataError("a set with videos needs a camera: --cameras front")
     env.reset(seed=seed)
-    side = 1 if hand == "r_hand" else -1  # palms are turned to each other
-    cube = cube_at(IN_HAND[hand], y=side * (PALM_SIZE[1] + CUBE_ROOM))
-    rig = env.rig(cameras, size, imperfections, {**CHECK, hand: cube}, {})
-    rng = np.random.default_rng((seed, n))
-    postures = varied_postures(rig, hand, n, rng)
-    offsets = np.zeros(len(env.joint_names))
-    moved = chain_of(rig, hand)
-    offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved))
-    named = {env.joint_names[one]: round(float(offsets[one]), 7) for one in moved}
-    cell = {**rig.content(), "joints": list(env.joint_names)}
-    cell |= {"joint_offsets": named} if offset_deg else {}
-
-    def measured(joints: Vector) -> Vector:
-        return joints - offsets + np.radians(noise_deg) * rng.standard_normal(len(joints))
-
+    cell = {**rig.content(), **env.cell_of_joints()}
+    if shows:
+        moved = calibration.chain_of(rig, hand)
+        offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
+        cell |= {"joint_offsets": {names[one]: float(offsets[one]) for one in moved}}
+    settings: dict[str, Any] = {
+        "objects": able.objects if true_poses else (),
+        "robot_type": env.robot_type or robot,
+        "units": env.units,
+    }
     sizes = dict.fromkeys(rig.views, size)
-    with Recorder(
-        out, fps, env.joint_names, sizes, cell, robot_type=robot, codec=codec
-    ) as recorder:
-        calibration_episode(
-            recorder, rig, postures, rng, measured, lambda joints: joints - offsets
-        )
+    called = [name + env.suffix for name in names]
+    with recording(out, fps, called, sizes, cell, codec=codec, **settings) as opened:
+        if shows:
+            postures = calibration.varied_postures(rig, hand, n, rng)
+
+            def measured(joints: Vector) -> Vector:
+                noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
+                return np.asarray(joints - offsets + noise)
+
+            for one in calibration.calibration_episode(
+                rig, postures, fps, rng, measured, lambda joints: joints - offsets
+            ):
+                opened.add_frame(one)
+            opened.save_episode()
+        else:
+            _demonstrate(opened, able, env, rig, n, seed, true_poses, progress)
     rig.close()
-    env.close()
     return Path(out)
 
 
-def _follow(
-    recorder: Recorder,
-    env: ControlledEnv,
-    rig: Any,
+def _demonstrate(
+    opened: Any,
     able: Expert,
-    rng: np.random.Generator,
+    env: ControlledEnv,
+    rig: Rig,
+    n: int,
+    seed: int,
     true_poses: bool,
-) -> tuple[bool, float]:
-    """Record an episode; whether it succeeds, and is kept, and its seconds."""
-    observation, actions = able.begin(env, rng)
-    over, info, seconds = False, {}, 0.0
-    for reference in actions:
-        poses = observation["environment_state"] if true_poses else None
-        recorder.add(
-            observation["agent_pos"], reference, rig.pictures(rng), env.task_description, poses
-        )
-        observation, _, _, over, info = env.step(reference)
-        seconds += 1 / env.fps
-    while not over:
-        *_, over, info = env.step(reference)
-    if info["is_success"]:
-        recorder.save()
-    else:
-        recorder.discard()
-    return bool(info["is_success"]), seconds
+    progress: Callable[[str], None],
+) -> None:
+    """Record demonstrations until so many succeed."""
+    for number in range(ATTEMPTS * n):
+        # each has numbers of its own: episode 3 is the same, however many there are
+        rng = np.random.default_rng((seed, number))
+        (observation, actions), over = able.begin(env, rng), False
+        for reference in actions:
+            poses = observation["environment_state"] if true_poses else None
+            seen, joints = rig.pictures(rng), observation["agent_pos"]
+            opened.add_frame(row(env.task_description, joints, reference, seen, poses))
+            observation, _, _, over, info = env.step(reference)
+        while not over:
+            *_, over, info = env.step(reference)
+        if info["is_success"]:
+            opened.save_episode()
+        else:
+            opened.clear_episode_buffer()
+        failed = "" if info["is_success"] else ": one failed, and is not kept"
+        progress(f"episode {opened.num_episodes} of {n}{failed}")
+        if opened.num_episodes == n:
+            return
+    raise DataError(
+        f"of {ATTEMPTS * n} demonstrations {opened.num_episodes} succeed, {n} are asked for"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -353,59 +298,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Record demonstrations with cameras as a LeRobot data set with videos.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument(
-        "--task", required=True, choices=(*EXPERTS, CALIBRATION),
-        help="what is done; calibration: tags in a hand are shown in varied postures",
-    )  # fmt: skip
-    parser.add_argument("--out", required=True, help="folder of the set; it must not exist")
-    parser.add_argument("--n", type=int, default=10, help="episodes, or postures")
-    parser.add_argument("--seed", type=int, default=0, help="of demonstrations and noise")
-    parser.add_argument("--cameras", default="front", help="names, with commas between them")
-    parser.add_argument("--fps", type=int, default=25, help="rows per second")
-    parser.add_argument(
-        "--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"),
-        help="of the pictures",
-    )  # fmt: skip
-    parser.add_argument("--robot", choices=ROBOTS, default=UPPER_BODY, help="who does it")
-    parser.add_argument("--codec", choices=CODECS, default="av1", help="of the videos")
-    shown = parser.add_argument_group("demonstrations")
-    shown.add_argument("--noise", type=float, default=0.0, help="of the sensors")
-    shown.add_argument(
-        "--true-poses", action="store_true", help="record the poses of the objects too"
-    )
-    moved = parser.add_argument_group("calibration")
-    moved.add_argument("--hand", choices=HANDS, default=HANDS[1], help="that has the tags")
-    moved.add_argument("--offset-deg", type=float, default=0.0, help="of the joints, constant")
-    moved.add_argument("--noise-deg", type=float, default=0.0, help="of the joints")
+    add, motion = parser.add_argument, f"of the task {CALIBRATION}"
+    tasks = (*EXPERTS, CALIBRATION)
+    add("--task", required=True, choices=tasks, help=f"{CALIBRATION} shows tags in a hand")
+    add("--out", required=True, help="folder of the set; it must not exist")
+    add("--n", type=int, default=10, help="episodes, or postures")
+    add("--seed", type=int, default=0, help="of demonstrations and noise")
+    add("--cameras", default="front", help="names, with commas between them")
+    add("--fps", type=int, default=25, help="rows per second")
+    add("--size", type=int, nargs=2, default=(640, 480), help="width and height of pictures")
+    add("--robot", choices=ROBOTS, default=UPPER_BODY, help="who does it")
+    add("--codec", choices=CODECS, default="av1", help="of the videos")
+    add("--noise", type=float, default=0.0, help="of the sensors, in demonstrations")
+    add("--true-poses", action="store_true", help="demonstrations with the poses of objects")
+    add("--hand", choices=HANDS, default=HANDS[1], help=f"that has the tags, {motion}")
+    add("--offset-deg", type=float, default=0.0, help=f"constant, of joints, {motion}")
+    add("--noise-deg", type=float, default=0.0, help=f"of joints, {motion}")
     given = vars(parser.parse_args(arguments))
-    task, given["size"] = given.pop("task"), tuple(given["size"])
-    calibrates = task == CALIBRATION
-    for name in ("noise", "true_poses") if calibrates else ("hand", "offset_deg", "noise_deg"):
-        if given.pop(name) != parser.get_default(name):
+    task, given["size"] = given["task"], tuple(given["size"])
+    others = ("noise", "true_poses"), ("hand", "offset_deg", "noise_deg")
+    for name in others[task != CALIBRATION]:
+        if given[name] != parser.get_default(name):
             parser.error(f"--{name.replace('_', '-')} is no option of the task {task}")
-    _hush()
+    _report_errors_alone()
     try:
-        out = (
-            record_calibration(**given) if calibrates else record(task, **given, progress=_say)
-        )
+        record(**given, progress=partial(print, file=sys.stderr, flush=True))
     except TPGMMError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"recorded {out}")
+    print(f"recorded {given['out']}")
     return 0
 
 
-def _hush() -> None:
-    """Let libraries report errors alone: progress is what this command says."""
+def _report_errors_alone() -> None:
+    """Quieten libraries: progress is what this command says."""
     from datasets.utils.logging import disable_progress_bar
 
     os.environ.setdefault("SVT_LOG", "1")
     logging.getLogger("lerobot").setLevel(logging.ERROR)
     disable_progress_bar()
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

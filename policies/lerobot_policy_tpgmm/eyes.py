@@ -10,7 +10,6 @@ from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig
 from lerobot_policy_tpgmm.observations import FrameFeatures
-from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots import Kinematics, Robot
 
@@ -37,19 +36,19 @@ def opened(config: TPGMMConfig) -> Any:
     return cell
 
 
-def take_over(given: Mapping[str, Any] | str, learned: Mapping[str, Any]) -> dict[str, Any]:
+def take_over(given: Any, learned: Mapping[str, Any]) -> dict[str, Any]:
     """The cell of a policy that was learned with another one; what differs is a warning.
 
     Parameters
     ----------
-    given : mapping or str
+    given : mapping or str, optional
         The content of a file, its path, or "none" for the cell without its cameras.
     learned : mapping
         The content of the other one.
     """
     from tpgmm_vision.cell import cell_of
 
-    if given == NO_CELL:
+    if given in (None, NO_CELL):
         return {**learned, "source": NO_CELL}
     cell = cell_of(given)
     if told := cell_of(learned).differences(cell):
@@ -71,9 +70,4 @@ def watching(cell: Any, robot: Kinematics, frames: FrameFeatures) -> Any:
     if links and isinstance(robot, Robot):
         robot = decode(encode(robot) | {"links": [*robot.links, *links]})
     read, known = frames.in_environment, frames.default is not None
-    try:
-        return Watch(cell, robot, [n for n in read if n in cell.objects or not known])
-    except DataError as error:
-        raise DataError(
-            f"{error}. --policy.cell={NO_CELL} takes poses that are observed otherwise"
-        ) from error
+    return Watch(cell, robot, [name for name in read if name in cell.objects or not known])

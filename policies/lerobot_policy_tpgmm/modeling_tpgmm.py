@@ -17,7 +17,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import NO_CELL, TPGMMConfig, state_features
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, declared
 from lerobot_policy_tpgmm.eyes import opened, take_over, watching
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
@@ -173,8 +173,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._check_size("state_names", state_names, config.robot_state_feature)
         action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
-        offsets = {} if cell is None else cell.joint_offsets
-        if dataset_meta is not None:  # of a converted set they are none
+        offsets = getattr(cell, "joint_offsets", {})
+        if dataset_meta is not None:  # a converted set declares none
             offsets = declared(config, dataset_meta.features, "offsets")
         every = state_names, action_names, config.units
         self.joints = JointFeatures(names, *every, self.kinematics, offsets)
@@ -497,18 +497,19 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         now, joints = batch.get(TIMESTAMP), self._observed(batch).numpy(force=True)
         times = None if now is None else now.flatten().numpy(force=True)
         self.watch.look(images, joints, passed, times)
-        found, self._ages = (
-            self.watch.first() if first else self.watch.poses(),
-            self.watch.ages(),
+        self._ages = self.watch.ages()
+        return self.frames.with_poses(
+            batch, self.watch.first() if first else self.watch.poses()
         )
-        return self.frames.with_poses(batch, found)
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
         """A running skill; None while robots stand because not all objects were seen."""
         check_rate(batch, self.config.rate)
         joints = self._observed(batch)
         if self.watch is not None:
-            self._stand = joints = joints if self._stand is None else self._stand
+            if self._stand is None:
+                self._stand = self.kinematics.joint_tensor(joints)
+            joints = self._stand
             if missing := self.watch.missing():
                 if missing != self._statuses.get(-1):
                     log.info("%s before the start: %s", Status.HOLDING, "; ".join(missing))
@@ -556,15 +557,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         several = command.codes.ndim > 0
         times = command.time.expand(command.codes.shape).flatten().tolist()
         for robot, status in enumerate(command.status if several else [command.status]):
-            reason, told = command.reason(robot if several else ()), [str(status)]
-            if self.watch is not None:
-                unseen = self.watch.unseen(robot)
-                reason, told = (
-                    "; ".join(filter(None, (reason, *unseen.values()))),
-                    [*told, *unseen],
-                )
-            if told != self._statuses.get(robot, [Status.RUNNING]):
-                what = f"{status}: {reason}" if reason else status
+            unseen = {} if self.watch is None else self.watch.unseen(robot)
+            reasons = command.reason(robot if several else ()), *unseen.values()
+            if (told := [str(status), *unseen]) != self._statuses.get(robot, [Status.RUNNING]):
+                what = ": ".join(filter(None, (status, "; ".join(filter(None, reasons)))))
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
             self._statuses[robot] = told
 
@@ -714,7 +710,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ),
             )
             if learned := json.loads(read_whole(folder / CONFIG_NAME)).get("cell"):
-                config.cell = take_over(config.cell or NO_CELL, learned)
+                config.cell = take_over(config.cell, learned)
             policy = cls(config, model=model, **options).eval().to(config.device)
             validated(policy.skill)  # with the settings of the configuration
         except TPGMMError:

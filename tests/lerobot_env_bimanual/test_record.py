@@ -27,10 +27,14 @@ def test_demonstrations_are_recorded_as_they_are_done(tmp_path, capsys):
     assert {one.key for one in cell.cameras.values()} == set(read.meta.video_keys)
     assert list(cell.objects) == list(shown.frames) == ["bottle", "tray"]
     bottle, tray = (shown.frame(name).position.numpy() for name in cell.objects)
-    assert np.linalg.norm(bottle[-1, :2] - tray[-1, :2]) < 0.005 < np.ptp(bottle[:, 2])
+    away = bottle[-1, :2] - tray.reshape(-1, 3)[0, :2]
+    assert np.linalg.norm(away) < 0.005 < np.ptp(bottle[:, 2])
     # what is recorded can be done once more: references of the set, sent to the environment
     env = expert("carry_and_put").environment(fps=25)
-    env.reset(seed=0, options=module.BOTTLES["carry_and_put"].start(shown))
+    frames = {name: shown.frame(name) for name in cell.objects}
+    first = {name: one[0] if one.batch_shape else one for name, one in frames.items()}
+    poses = {name: np.append(one.position, one.orientation) for name, one in first.items()}
+    env.reset(seed=0, options={"joints": shown.joints[0].numpy(), **poses})
     for row in range(len(read)):
         observation, *_ = env.step(read.hf_dataset[row]["action"].numpy())
     np.testing.assert_allclose(observation["agent_pos"], shown.joints[-1], atol=0.01)
@@ -43,9 +47,10 @@ def test_poses_are_left_out_unless_they_are_asked_for(tmp_path):
     assert main([*command, *SMALL, "--out", str(tmp_path / "set")]) == 1
 
 
-def test_a_calibration_is_an_ordinary_episode(tmp_path):
+def test_a_calibration_is_an_ordinary_episode(tmp_path, monkeypatch):
+    monkeypatch.setattr(module.calibration, "DRAWN", 2000)
     command = ["--task", "calibration", "--n", "3", "--offset-deg", "1", "--hand", "l_hand"]
-    assert main([*command, *SMALL, "--out", str(tmp_path / "set")]) == 0
+    assert main([*command, "--fps", "10", "--out", str(tmp_path / "set")]) == 0
     read, cell = opened(tmp_path / "set"), read_cell(tmp_path / "set" / "cell.json")
     assert read.num_episodes == 1 and not cell.objects
     assert set(cell.joint_offsets) == {one for one in cell.joints if not one.startswith("r_")}
@@ -53,7 +58,7 @@ def test_a_calibration_is_an_ordinary_episode(tmp_path):
     assert 0.2 < np.degrees(np.abs(offsets[offsets != 0]).mean()) < 3
     states = np.stack([read.hf_dataset[row]["observation.state"] for row in range(len(read))])
     still = np.abs(np.diff(states, axis=0)).max(axis=1) < 2e-3
-    assert 3 * 7 < still.sum() < len(still) - 10, "it stands in each posture, and moves"
+    assert 3 * 3 <= still.sum() < len(still) - 10, "it stands in each posture, and moves"
 
 
 def test_what_is_not_there_is_refused(tmp_path, capsys):

@@ -11,6 +11,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support import planted_poses as planted
 from tests.support.lerobot_metadata import dataset
 from tests.support.policies import ENVIRONMENT, STATE, fitted
 from tpgmm_datasets.robots import parse_robot, upper_body_urdf
@@ -144,3 +145,41 @@ def test_units_may_be_the_calibration_of_the_robot(tmp_path):
     adopt(made, dataset(20, **environment(POSE)))
     scale = Scale.calibrated(0, 2048)
     assert made.units == {name: [scale.factor, scale.offset] for name in NAMES[:3]}
+
+
+def tracked(path, **cell):
+    """A data set in which tracking has left its cell, and offsets of joints."""
+    cell = {"cameras": planted.cell_content()["cameras"], **cell}
+    (path / "meta").mkdir()
+    (path / "meta" / "cell.json").write_text(json.dumps(cell))
+    feature = {"dtype": "float32", "shape": (17,), "names": list(NAMES)}
+    feature["info"] = {"offsets": [0.02, *[0.0] * 16]}
+    made = dataset(20, **environment(POSE), **{STATE: feature, "action": feature})
+    made.root = path
+    return made, cell
+
+
+def test_the_cell_of_a_tracked_set_goes_along(tmp_path):
+    bottle = {"bottle": {"target": {"tag": 3, "size": 0.06}}}
+    meta, cell = tracked(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
+    made = config(**UPPER_BODY)
+    policy = TPGMMPolicy(made, dataset_meta=meta)
+    assert made.cell == cell and policy.watch is not None
+    # of the set's pictures those that the cell looks at
+    assert set(made.input_features) == {STATE, ENVIRONMENT, planted.KEY}
+    joints = policy.joints.joints(torch.zeros(1, 17))[0]
+    assert float(joints[0]) == 0.02 and not joints[1:].any()
+    blind = config(**UPPER_BODY, cell="none")
+    assert TPGMMPolicy(blind, dataset_meta=meta).watch is None
+    assert blind.cell == cell | {"source": "none"}
+    assert set(blind.input_features) == {STATE, ENVIRONMENT}
+
+
+def test_a_set_is_learned_with_its_own_offsets_and_run_with_those_of_its_cell(tmp_path, caplog):
+    bottle = {"bottle": {"target": {"tag": 3, "size": 0.06}}}
+    meta, cell = tracked(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
+    other = cell | {"joint_offsets": {NAMES[0]: 0.05}}
+    policy = TPGMMPolicy(config(**UPPER_BODY, cell=other), dataset_meta=meta)
+    assert float(policy.joints.joints(torch.zeros(1, 17))[0, 0]) == 0.02
+    assert "is offset by +1.72 deg more" in caplog.text
+    assert policy.config.cell == other

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.envs import preprocess_observation
 
+from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
+from lerobot_env_bimanual.rendering import offscreen
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support import recorded_tags
 from tests.support.lerobot_commands import lerobot
@@ -18,6 +21,7 @@ from tpgmm_vision import sources
 from tpgmm_vision.poses import inverse, pose_matrix, pose_vector, rigid
 
 RATE = 25.0
+needs_pictures = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 LOST = np.full(7, np.nan)
 
 
@@ -317,3 +321,49 @@ def test_lerobot_rollout_without_that_camera_says_what_to_do(tmp_path):
     done, _ = rollout(tmp_path, f"--policy.cell={cell}")
     assert done.returncode != 0
     assert "takes the pictures 'observation.images.front', there are []" in done.stderr
+
+
+def rendered():
+    """An environment whose camera sees the bottle, and its cell."""
+    env = BottleShakingEnv(fps=20, cameras="front")
+    env.reset(seed=3)
+    return env, {**env.rig("front").content(), "joints": list(env.joint_names)}
+
+
+@needs_pictures
+def test_poses_of_a_rendered_environment_are_true():
+    env, cell = rendered()
+    acting = changed(fitted(), control_fps=20.0, cell=cell)
+    now, _ = env.reset(seed=3)
+    for _ in range(5):
+        seen = preprocess_observation(
+            {k: v for k, v in now.items() if k != "environment_state"}
+        )
+        now, *_ = env.step(acting.select_action(seen)[0].numpy())
+        [found], true = acting.watch.poses()["bottle"], now["environment_state"]
+        np.testing.assert_allclose(found[:3], true[:3], atol=2e-3)
+        np.testing.assert_allclose(found[3:], true[3:], atol=0.01)
+    assert acting._controller is not None
+    env.close()
+
+
+@needs_pictures
+def test_lerobot_eval_looks_through_the_cameras_of_an_environment(tmp_path):
+    env, cell = rendered()
+    env.close()
+    changed(fitted(), control_fps=20.0, cell=cell).save_pretrained(tmp_path / "policy")
+    command = (
+        "eval", f"--policy.path={tmp_path / 'policy'}", "--env.type=bottle_shaking",
+        "--env.fps=20", "--env.episode_length=8", "--env.observe_objects=false",
+        "--eval.n_episodes=1", "--eval.batch_size=1",
+    )  # fmt: skip
+    seen = lerobot(
+        *command, "--env.cameras=front", f"--output_dir={tmp_path / 'eval'}", home=tmp_path,
+        drawing=offscreen(),
+    )  # fmt: skip
+    assert seen.returncode == 0, seen.stderr
+    assert "holding before the start: robot 0 does not see 'bottle'" in seen.stderr
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    blind = lerobot(*command, f"--output_dir={tmp_path / 'blind'}", home=tmp_path)
+    assert blind.returncode != 0
+    assert "camera 'front' of the cell takes the pictures" in blind.stderr

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support import planted_poses
 from tests.support.command_line import output, run
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
@@ -150,3 +151,14 @@ def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
     first = np.abs(wanted.joints[:60].numpy() - moved[0]).max(axis=1)
     assert first.min() < 0.05
     assert np.ptp(moved, axis=0).max() > 0.05
+
+
+def test_the_cell_of_a_tracked_set_goes_along(tmp_path):
+    shaking = replace(generator(), steady_rhythm=True)
+    save_lerobot(shaking.demonstrations(4, seed=0), tmp_path / "set", fps=20, task="shake")
+    cell = planted_poses.cell_content()
+    (tmp_path / "set" / "meta" / "cell.json").write_text(json.dumps(cell | {"source": "tags"}))
+    output("fit", tmp_path / "set", *BOTTLE, "--rate", 5, "--out", tmp_path / "policy")
+    config = TPGMMPolicy.from_pretrained(tmp_path / "policy").config
+    assert config.cell == cell | {"source": "tags"}
+    assert planted_poses.KEY in config.input_features

@@ -52,11 +52,11 @@ BUDGETS = {
 #: when its budget is reached.
 CEILINGS = {
     "lines of tpgmm_torch": 13860,
-    "lines of tpgmm_datasets": 4690,
-    "lines of lerobot_policy_tpgmm": 1920,
-    "lines of tpgmm_tools": 2840,
-    "lines of environments and evaluation": 8950,
-    "lines of tests of core, data sets, policy and tools": 19330,
+    "lines of tpgmm_datasets": 4775,
+    "lines of lerobot_policy_tpgmm": 2030,
+    "lines of tpgmm_tools": 2875,
+    "lines of environments and evaluation": 9400,
+    "lines of tests of core, data sets, policy and tools": 19660,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,
 }

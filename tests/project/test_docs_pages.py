@@ -14,7 +14,7 @@ import typer
 from packaging.requirements import Requirement
 from typer.testing import CliRunner
 
-from tests.support import first_skill
+from tests.support import first_skill, recorded_cell
 from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import TASK, BottleShaking
@@ -64,8 +64,17 @@ def demo(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory) -> Path:
+    """A folder with recordings of an arm, a cup and a board before a camera."""
+    folder = tmp_path_factory.mktemp("cell")
+    recorded_cell.record(folder)
+    return folder
+
+
 def check_options(program: str, arguments: list[str]) -> None:
     """Options of LeRobot's commands exist; other tests run them, which takes half a minute."""
+    from lerobot.configs.dataset import DatasetRecordConfig
     from lerobot.configs.default import DatasetConfig, EvalConfig
     from lerobot.configs.eval import EvalPipelineConfig
     from lerobot.configs.train import TrainPipelineConfig
@@ -73,21 +82,26 @@ def check_options(program: str, arguments: list[str]) -> None:
     from lerobot.robots import RobotConfig, so_follower
     from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
     from lerobot.rollout.inference import InferenceEngineConfig
+    from lerobot.scripts.lerobot_record import RecordConfig
+    from lerobot.teleoperators import TeleoperatorConfig, so_leader
 
     import lerobot_env_bimanual
     from lerobot_policy_tpgmm import TPGMMConfig
 
-    assert so_follower and lerobot_env_bimanual  # they register what pages use
+    assert so_follower and so_leader and lerobot_env_bimanual  # they register what pages use
     options = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
     of_command = {
         "lerobot-eval": EvalPipelineConfig,
         "lerobot-train": TrainPipelineConfig,
+        "lerobot-record": RecordConfig,
         "lerobot-rollout": RolloutConfig,
     }
-    groups = {"policy": TPGMMConfig, "eval": EvalConfig, "dataset": DatasetConfig}
+    of_dataset = DatasetRecordConfig if program == "lerobot-record" else DatasetConfig
+    groups = {"policy": TPGMMConfig, "eval": EvalConfig, "dataset": of_dataset}
     choices = {
         "env": EnvConfig,
         "robot": RobotConfig,
+        "teleop": TeleoperatorConfig,
         "strategy": RolloutStrategyConfig,
         "inference": InferenceEngineConfig,
     }
@@ -140,8 +154,11 @@ def run(command: str) -> None:
 )
 # the demo of these tests has so few demonstrations that a fold has only two
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_code_and_commands_of_a_page_run_from_top_to_bottom(page, demo, tmp_path, monkeypatch):
-    shutil.copytree(demo, tmp_path, dirs_exist_ok=True)
+def test_code_and_commands_of_a_page_run_from_top_to_bottom(
+    page, request, tmp_path, monkeypatch
+):
+    given = "cell" if page.name == "cell.md" else "demo"
+    shutil.copytree(request.getfixturevalue(given), tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     names = {"__name__": page.stem}
     for language, text in blocks(page):

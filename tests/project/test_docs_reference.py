@@ -110,7 +110,7 @@ def test_every_command_has_its_help_on_the_page_of_the_command_line():
     group = typer.main.get_command(application.app)
     context = typer.Context(group)
     names = group.list_commands(context)
-    commands = {name: group.get_command(context, name) for name in names}
+    commands = {name: group.resolve_command(context, [name])[1] for name in names}
     known = {name for name, command in commands.items() if not hasattr(command, "commands")} | {
         f"{name} {inner}"
         for name, command in commands.items()

@@ -8,8 +8,13 @@ from pathlib import Path
 PLUGINS = Path(__file__).parent / "plugins"
 
 
-def lerobot(command: str, *arguments: object, home: Path) -> subprocess.CompletedProcess[str]:
-    """Run ``lerobot-<command>``, offline; the robot of the tests is installed for it."""
+def lerobot(
+    command: str, *arguments: object, home: Path, drawing: str = "disabled"
+) -> subprocess.CompletedProcess[str]:
+    """Run ``lerobot-<command>``, offline; the robot of the tests is installed for it.
+
+    Pictures are blank, unless MuJoCo's way of ``drawing`` is named.
+    """
     metadata = home / "lerobot_robot_bimanual-0.dist-info" / "METADATA"
     metadata.parent.mkdir(parents=True, exist_ok=True)
     metadata.write_text("Metadata-Version: 2.1\nName: lerobot_robot_bimanual\nVersion: 0\n")
@@ -21,7 +26,7 @@ def lerobot(command: str, *arguments: object, home: Path) -> subprocess.Complete
         "HF_HUB_OFFLINE": "1",
         "OMP_NUM_THREADS": "1",
         "CUDA_VISIBLE_DEVICES": "",
-        "MUJOCO_GL": "disabled",  # videos of blank pictures
+        "MUJOCO_GL": drawing,
         "SLURM_JOB_ID": "1",  # no progress bars
     }
     script = Path(sys.executable).with_name(f"lerobot-{command}")

@@ -15,5 +15,5 @@ def dataset(fps=None, names=None, **features):
     }
     episodes = {"episode_index": [0], "dataset_from_index": [0], "dataset_to_index": [9]}
     return SimpleNamespace(
-        fps=fps, features={**columns, **features}, episodes=episodes, stats={}
+        fps=fps, features={**columns, **features}, episodes=episodes, stats={}, root="no set"
     )

@@ -26,7 +26,7 @@ CUP_IN_CUBE = rigid(np.zeros(3), (0.0, 0.0, -0.06))
 CUBE_IN_HAND = rigid((0.3, 0.2, 0.1), (0.0, 0.0, 0.04))
 BASE_TAG = rigid((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))
 HOME = np.array([0.0, -0.6, 0.6, 0.6, 0.0, 1.2])
-SAMPLES = 3
+SAMPLES = 2
 
 
 def looking(eye: tuple[float, float, float], at: tuple[float, float, float]) -> Array:
@@ -136,7 +136,7 @@ def _shown(robot: Robot, n: int, rng: np.random.Generator) -> Episode:
             found.append(joints)
     rows = [found[1]]
     for before, after in pairwise(found[1:]):
-        rows += [*np.linspace(before, after, FPS // 2), *[after] * FPS]
+        rows += [*np.linspace(before, after, FPS // 2), *[after] * (FPS // 2)]
     joints = np.stack([found[1]] * FPS + rows)
     things = [
         [(hand @ CUBE_IN_HAND, IN_HAND), (BASE_TAG, BASE)] for hand in _hands(robot, joints)

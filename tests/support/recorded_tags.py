@@ -85,3 +85,31 @@ def record(root, episodes, *, codec="libsvtav1", images=False, seed=0):
         made.save_episode()
     made.finalize()
     return root
+
+
+def carried(rows, covered=(), shift=0.0):
+    """An episode in which a hand moves the tag: what is drawn, and poses of hand and tag.
+
+    In ``covered`` stretches, ``(first, last)`` rows, nothing is drawn. All is moved by
+    ``shift`` along y [m].
+    """
+    time = np.arange(rows) / FPS
+    shares = [
+        np.clip((time - begin) / length, 0, 1)[:, None]
+        for begin, length in ((0, 0.6), (0.8, 0.8), (1.8, 0.5))
+    ]
+    come, go, leave = (share**2 * (3 - 2 * share) for share in shares)
+    way = np.array([[-0.15, -0.1, 0.2], [-0.05, 0, 0.02], [0.05, 0.05, 0.02], [0, 0.1, 0.2]])
+    place = (
+        way[0] + come * (way[1] - way[0]) + go * (way[2] - way[1]) + leave * (way[3] - way[2])
+    )
+    place += np.stack(
+        (0 * time, shift + 0 * time, 0.05 * np.sin(np.pi * go[:, 0]) ** 2), axis=1
+    )
+    hand = [rigid([0, 0, 0.6 * turn], p) for turn, p in zip(go[:, 0], place, strict=True)]
+    first, last = int(0.8 * FPS), int(1.7 * FPS)
+    grasp = inverse(hand[first]) @ rigid([0, 0.1, 0.4], way[1] + [0, shift, 0.02])
+    true = [hand[min(max(row, first), last)] @ grasp for row in range(rows)]
+    hidden = {row for a, b in covered for row in range(a, b + 1)}
+    drawn = [{} if row in hidden else {NUMBER: pose} for row, pose in enumerate(true)]
+    return drawn, hand, np.array(true)

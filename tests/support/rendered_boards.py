@@ -65,8 +65,8 @@ class BoardCamera:
 
 def ray_error(camera: Camera, true: Camera) -> float:
     """How far rays are off after the best rotation, mean over the picture [m at 1 m]."""
-    grid = np.stack(np.meshgrid(np.linspace(20, true.width - 20, 12),
-                                np.linspace(20, true.height - 20, 9)), -1).reshape(-1, 2)  # fmt: skip
+    across, down = np.linspace(20, true.width - 20, 12), np.linspace(20, true.height - 20, 9)
+    grid = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
     one, other = (
         np.concatenate((each.rays(grid), np.ones((len(grid), 1))), 1) for each in (camera, true)
     )

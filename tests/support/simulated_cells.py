@@ -25,7 +25,7 @@ CUBE, OTHER, LARGE = (
     for first, size in ((10, 0.03), (20, 0.03), (10, 0.04))
 )
 #: Pixels of a module of a drawn tag, and drawn pixels of a picture's pixel.
-MODULE, FINE = 16, 4
+MODULE, FINE = 16, 3
 IN_HAND = rigid(np.radians([10, 20, 30]), (0.0, 0.0, -0.05))
 
 
@@ -130,7 +130,8 @@ class SimulatedCell:
                 -self.reach, self.reach, (64, self.robot.n_joints)
             )
             seen = self.corners(joints, rng)
-            high = np.all([self.links(joints, l)[:, 2, 3] > 0.03 for l in self.robot.links], 0)
+            heights = [self.links(joints, one)[:, 2, 3] for one in self.robot.links]
+            high = (np.array(heights) > 0.03).all(0)
             found += [
                 joints[k]
                 for k in range(64)
@@ -249,9 +250,10 @@ def record(root: Path, cell: SimulatedCell, postures: Array, rng: np.random.Gene
     measured[1::4] = true[1::4]
     seen = cell.corners(true, rng)
     for k, row in enumerate(np.degrees(measured).astype(np.float32)):
-        pictures = {
-            keys[name]: drawn(cell.camera, found[k], rng) for name, found in seen.items()
-        }
+        if k == 0 or not np.array_equal(true[k], true[k - 1]):
+            pictures = {
+                keys[name]: drawn(cell.camera, found[k], rng) for name, found in seen.items()
+            }
         made.add_frame({"observation.state": row, "action": row, "task": "wave", **pictures})
     made.save_episode()
     made.finalize()

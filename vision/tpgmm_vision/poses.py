@@ -95,7 +95,7 @@ def angle_between(one: Array, other: Array) -> float:
     return float(Rotation.from_matrix(one[:3, :3].T @ other[:3, :3]).magnitude())
 
 
-def mean_pose(poses: Sequence[Array]) -> tuple[Array, NDArray[np.bool_]]:
+def mean_pose(poses: Sequence[Array] | Array) -> tuple[Array, NDArray[np.bool_]]:
     """Mean of those poses that agree, and which those are.
 
     Poses are left out that are further than 2 mm or 2 degrees, and further than three times the

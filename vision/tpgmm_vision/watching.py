@@ -55,7 +55,10 @@ class Watch:
 
     def __init__(self, cell: Cell, robot: Any, names: Sequence[str]) -> None:
         if missing := [name for name in names if name not in cell.objects]:
-            raise DataError(f"the cell has the objects {list(cell.objects)}, not {missing}")
+            raise DataError(
+                f"the cell has the objects {list(cell.objects)}, not {missing}: add them to "
+                "its file, or take poses that are observed otherwise (--policy.cell=none)"
+            )
         ours, theirs = (
             {name for name in joints if not is_gripper(name)}
             for joints in (robot.joint_names, cell.joints)
@@ -125,7 +128,7 @@ class Watch:
             pose, at = self._pose(row, name), (row, name)
             recent = self._recent.setdefault(at, deque(maxlen=RECENT))
             recent.append(None if pose is None else pose_matrix(pose))
-            self._unseen[at] = self._unseen.get(at, 0.0) + float(elapsed[row])
+            self._unseen[at] = self._unseen.get(at, 0.0) + max(float(elapsed[row]), 0.0)
             if pose is not None:
                 self._unseen[at] = 0.0
 
@@ -135,7 +138,8 @@ class Watch:
         if camera.key not in images:
             raise DataError(
                 f"camera {name!r} of the cell takes the pictures {camera.key!r}, there are "
-                f"{sorted(images)}: say in the cell which of them it takes, or let it take them"
+                f"{sorted(images)}: let the robot or the environment have it, say in the cell "
+                "which it is, or take poses that are observed otherwise (--policy.cell=none)"
             )
         stack = np.asarray(images[camera.key])
         if stack.ndim != 4 or stack.shape[1] != 3:

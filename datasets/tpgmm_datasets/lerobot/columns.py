@@ -5,6 +5,9 @@
 ``observation.environment_state``
     The frames, seven values each: x y z [m], then the unit quaternion w x y z; named
     ``bottle.x`` ... ``bottle.qz``.
+``tracking.seen``, ``tracking.known``, ``tracking.residual``
+    By object: whether its pose was measured in a picture; measured or inferred; how well
+    [pixels].
 ``event.<name>``
     True at the one step nearest to the event.
 ``action``
@@ -45,6 +48,9 @@ Features = dict[str, dict[str, Any]]
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 EVENT = "event."
+#: Of sets in whose pictures objects were tracked. They do not begin with "observation.": no
+#: policy shall take them for something that it is given.
+SEEN, KNOWN, RESIDUAL = "tracking.seen", "tracking.known", "tracking.residual"
 #: What joints of demonstrations are in: the last is a coordinate's own scale.
 JOINT_UNITS = ("rad", "m", "raw")
 #: Fraction of a period by which the time of a step may be off the grid of ``fps``.

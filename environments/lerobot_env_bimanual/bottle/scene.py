@@ -42,7 +42,7 @@ __all__ = [
 #: Height of the cap's top above the bottle's origin [m], on which a cube of tags stands; a tag
 #: lies before the tray.
 CAP = FOOT + 0.062
-CARRIERS = {"bottle": cube_at(10, z=CAP + CUBE_ROOM), "tray": flat_at(20, 0.13, z=0.001)}
+CARRIERS = {"bottle": cube_at(10, z=CAP + CUBE_ROOM), "tray": flat_at(20, 0.13, 0.001)}
 #: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
 #: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2

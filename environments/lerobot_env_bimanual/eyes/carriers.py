@@ -11,6 +11,7 @@ import cv2
 import mujoco
 import numpy as np
 
+from lerobot_env_bimanual.robot_scene import add_geom
 from tpgmm_vision.poses import Array, pose_vector, rigid
 from tpgmm_vision.targets import FAMILIES, Target, modules_of, target_from
 
@@ -26,13 +27,9 @@ PIXELS = 32
 THICKNESS = 0.001
 #: How much a plate shines by itself, so that sides in the shade are seen.
 EMISSION = 0.25
-#: Faces of a plate: two triangles that show the tag, then its back and its edges.
-PLATE = (
-    (0, 3, 1), (1, 3, 2),
-    (4, 5, 7), (5, 6, 7), (0, 1, 4), (1, 5, 4), (1, 2, 5), (2, 6, 5), (2, 3, 6), (3, 7, 6),
-    (3, 0, 7), (0, 4, 7),
-)  # fmt: skip
-#: Where the corners of the tag are in its texture, and a white place.
+#: Triangles of a plate between the corners of its front and those of its back; the first two
+#: show the texture, whose corners come first, the others a white place of it.
+PLATE = "031 132 457 567 014 154 125 265 236 376 307 047"
 TEXTURE = ((0, 0), (1, 0), (1, 1), (0, 1), (0.01, 0.01))
 
 
@@ -61,7 +58,7 @@ class Carrier:
 
 
 def cube_at(
-    first: int, x: float = 0.0, y: float = 0.0, z: float = 0.0, size: float = CUBE
+    first: int, x: float = 0, y: float = 0, z: float = 0, size: float = CUBE
 ) -> Carrier:
     """A cube of five tags, turned as the body is.
 
@@ -74,31 +71,26 @@ def cube_at(
     size : float, default=0.04
         Edges of the black squares; the cube is a quarter larger [m].
     """
-    entry = {"cube": [*range(first, first + 5)], "size": size}
-    return Carrier(entry, rigid(np.zeros(3), (x, y, z)))
+    cube = {"cube": [*range(first, first + 5)], "size": size}
+    return Carrier(cube, rigid(np.zeros(3), (x, y, z)))
 
 
 def flat_at(
-    number: int,
-    x: float = 0.0,
-    y: float = 0.0,
-    z: float = 0.0,
-    size: float = FLAT,
-    upright: bool = True,
+    number: int, x: float, z: float, size: float = FLAT, upright: bool = True
 ) -> Carrier:
     """A tag that lies in the plane z of the body, to be read from before the robot.
 
     Parameters
     ----------
     number : int
-    x, y, z : float
-        Its middle in the frame of the body [m].
+    x, z : float
+        Its middle in the frame of the body, in whose plane y = 0 it is [m].
     size : float, default=0.06
         Edge of the black square [m].
     upright : bool, default=True
         Whether the body always lies level.
     """
-    pose = rigid((0.0, 0.0, math.pi / 2), (x, y, z))
+    pose = rigid((0.0, 0.0, math.pi / 2), (x, 0.0, z))
     return Carrier({"tag": number, "size": size}, pose, upright)
 
 
@@ -115,42 +107,27 @@ def add_carrier(spec: mujoco.MjSpec, body: str, carrier: Carrier) -> None:
     """
     target = carrier.target
     modules = modules_of(target.family)
+    dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[target.family])
     for number, corners in target.corners.items():
-        name, half = f"tag {number}", np.linalg.norm(corners[1] - corners[0]) / 2
-        half *= (modules + 2) / modules
-        _add_texture(spec, name, target.family, number, modules)
-        edge = np.array(
-            [[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]]
-        )
-        corner, faces = np.full((len(PLATE), 3), len(TEXTURE) - 1), np.array(PLATE)
-        corner[:2] = faces[:2]
-        mesh = spec.add_mesh(name=name)
-        mesh.uservert = np.concatenate((edge, edge - (0, 0, THICKNESS))).ravel().tolist()
-        mesh.userface, mesh.userfacetexcoord = faces.ravel().tolist(), corner.ravel().tolist()
-        mesh.usertexcoord = np.ravel(TEXTURE).tolist()
-        place = pose_vector(carrier.pose @ _tag_pose(corners))
-        spec.body(body).add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name,
-            pos=place[:3], quat=place[3:], contype=0, conaffinity=0, mass=0,
+        black = cv2.aruco.generateImageMarker(dictionary, number, modules * PIXELS)
+        picture = np.pad(black, PIXELS, constant_values=255)
+        name, (height, width) = f"tag {number}", picture.shape
+        texture = spec.add_texture(name=name, width=width, height=height, nchannel=3)
+        texture.type = mujoco.mjtTexture.mjTEXTURE_2D
+        texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
+        material = spec.add_material(name=name, specular=0.0, shininess=0.0, emission=EMISSION)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        x, y = corners[1] - corners[0], corners[0] - corners[3]
+        half, x, y = np.linalg.norm(x) / 2, x / np.linalg.norm(x), y / np.linalg.norm(y)
+        pose = carrier.pose @ rigid(np.stack((x, y, np.cross(x, y)), 1), corners.mean(axis=0))
+        edge = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * half
+        front = edge * (modules + 2) / modules
+        faces = np.array([[int(one) for one in face] for face in PLATE.split()])
+        shown = np.where(np.arange(len(faces))[:, None] < 2, faces, len(TEXTURE) - 1)
+        mesh = spec.add_mesh(name=name, userface=faces.ravel(), userfacetexcoord=shown.ravel())
+        mesh.uservert = np.concatenate((front, front - (0, 0, THICKNESS))).ravel()
+        mesh.usertexcoord = np.ravel(TEXTURE)
+        add_geom(
+            spec.body(body), mujoco.mjtGeom.mjGEOM_MESH, (0, 0, 0), name=name, meshname=name,
+            material=name, pos=pose[:3, 3], quat=pose_vector(pose)[3:], mass=0,
         )  # fmt: skip
-
-
-def _tag_pose(corners: Array) -> Array:
-    """The frame (4, 4) of a tag whose corners (4, 3) these are."""
-    x, y = corners[1] - corners[0], corners[0] - corners[3]
-    x, y = x / np.linalg.norm(x), y / np.linalg.norm(y)
-    return rigid(np.stack((x, y, np.cross(x, y)), axis=1), corners.mean(axis=0))
-
-
-def _add_texture(spec: Any, name: str, family: str, number: int, modules: int) -> None:
-    """A texture with a white module around the tag, and the material of it."""
-    dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[family])
-    black = cv2.aruco.generateImageMarker(dictionary, number, modules * PIXELS)
-    picture = np.pad(black, PIXELS, constant_values=255)
-    texture = spec.add_texture(
-        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3,
-        width=picture.shape[1], height=picture.shape[0],
-    )  # fmt: skip
-    texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
-    material = spec.add_material(name=name, specular=0.0, shininess=0.0, emission=EMISSION)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name

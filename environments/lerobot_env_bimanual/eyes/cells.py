@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.cell import pose_content
-from tpgmm_vision.poses import Array, pose_matrix, rigid
+from tpgmm_vision.poses import pose_matrix, rigid
 
 __all__ = ["cell_of", "perturbed"]
 
@@ -27,8 +28,10 @@ def cell_of(env: Any) -> dict[str, Any]:
     DataError
         If it has no cameras.
     """
-    content: dict[str, Any] = env.unwrapped.cell()
-    return content
+    env = env.unwrapped
+    if env.eyes is None:
+        raise DataError("the environment has no cameras: make it with cameras='front'")
+    return {**env.eyes.content(), **env.cell_of_joints()}
 
 
 def perturbed(
@@ -52,15 +55,9 @@ def perturbed(
     """
     rng, wrong = np.random.default_rng(seed), copy.deepcopy(dict(content))
     for camera in wrong["cameras"].values():
-        way, axis = (_direction(rng) for _ in range(2))
-        error = rigid(np.radians(deg) * axis, np.zeros(3))
-        pose = pose_matrix(camera["pose"]) @ error
+        way, axis = (one / np.linalg.norm(one) for one in rng.standard_normal((2, 3)))
+        pose = pose_matrix(camera["pose"]) @ rigid(np.radians(deg) * axis, np.zeros(3))
         pose[:3, 3] += 1e-3 * mm * way
         camera["pose"] = pose_content(pose)
         camera["focal_length"] = [(1 + focal) * one for one in camera["focal_length"]]
     return wrong
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    drawn = rng.standard_normal(3)
-    return np.asarray(drawn / np.linalg.norm(drawn))

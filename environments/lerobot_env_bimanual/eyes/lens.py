@@ -37,13 +37,9 @@ def usual_camera(width: int = 640, height: int = 480) -> Camera:
     width, height : int
         Of its pictures [pixels].
     """
-    middle = [
-        (n - 1) / 2 + off * width for n, off in zip((width, height), OFF_CENTRE, strict=True)
-    ]
-    focal_length = FOCAL * width
-    return Camera(
-        width, height, (focal_length, focal_length), (middle[0], middle[1]), DISTORTION
-    )
+    (right, down), focal_length = OFF_CENTRE, FOCAL * width
+    middle = (width - 1) / 2 + right * width, (height - 1) / 2 + down * width
+    return Camera(width, height, (focal_length, focal_length), middle, DISTORTION)
 
 
 class Lens:
@@ -67,33 +63,27 @@ class Lens:
     """
 
     def __init__(self, camera: Camera) -> None:
-        n, (fx, fy) = OVERSAMPLING, camera.focal_length
-        self.camera = camera
-        width, height = (
-            round(n * one * (1 + 2 * MARGIN)) for one in (camera.width, camera.height)
-        )
+        self.camera, n, sides = camera, OVERSAMPLING, (camera.width, camera.height)
+        width, height = (round(n * side * (1 + 2 * MARGIN)) for side in sides)
         self.size = width, height
-        focal_length = n * math.sqrt(fx * fy)
+        focal_length = n * math.sqrt(camera.focal_length[0] * camera.focal_length[1])
         self.fovy = 2 * math.degrees(math.atan(height / 2 / focal_length))
-        columns, rows = (
-            (np.arange(n * one) + 0.5) / n - 0.5 for one in (camera.width, camera.height)
-        )
-        rays = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
-        x, y = (
-            (rays[:, k] * focal_length + (side - 1) / 2).reshape(len(rows), -1)
-            for k, side in enumerate(self.size)
-        )
-        if min(x.min(), y.min()) < 0 or x.max() > width - 1 or y.max() > height - 1:
+        grid = np.meshgrid(*((np.arange(n * side) + 0.5) / n - 0.5 for side in sides))
+        rays = camera.rays(np.stack(grid, axis=-1).reshape(-1, 2)).reshape(*grid[0].shape, 2)
+        places = rays * focal_length + (np.array(self.size) - 1) / 2
+        if places.min() < 0 or (places.max(axis=(0, 1)) > np.array(self.size) - 1).any():
             raise DataError(
-                f"a camera with the distortion {camera.distortion}, the principal point "
-                f"{camera.principal_point} and different focal lengths cannot be drawn: its "
-                f"picture is more than {MARGIN:.0%} wider than one without these"
+                f"a lens with the distortion {camera.distortion} and the principal point "
+                f"{camera.principal_point} cannot be drawn: it sees further than {MARGIN:.0%} "
+                "beyond the picture of a camera without these"
             )
-        self._maps = cv2.convertMaps(x.astype(np.float32), y.astype(np.float32), cv2.CV_16SC2)
+        x, y = np.moveaxis(places.astype(np.float32), -1, 0)
+        self._maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
 
     def __call__(self, ideal: Picture) -> Picture:
         """The picture (height, width, 3) of an ideal one that has ``size`` and ``fovy``."""
-        bent = cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR)
+        x, y = self._maps
+        bent = cv2.remap(ideal, x, y, cv2.INTER_LINEAR)
         size = self.camera.width, self.camera.height
         return np.asarray(cv2.resize(bent, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
@@ -133,9 +123,8 @@ class Imperfections:
         if self.blur:
             seen = cv2.GaussianBlur(seen, (0, 0), self.blur)
         if self.noise:
-            drawn = rng.standard_normal(seen.shape, dtype=np.float32)
-            np.multiply(drawn, self.noise, out=drawn)
-            seen = cv2.add(seen, drawn, dtype=cv2.CV_8U)
+            noise = self.noise * rng.standard_normal(seen.shape, dtype=np.float32)
+            seen = cv2.add(seen, noise, dtype=cv2.CV_8U)
         if self.jpeg is not None:
             quality = [cv2.IMWRITE_JPEG_QUALITY, self.jpeg]
             seen = cv2.imdecode(cv2.imencode(".jpg", seen, quality)[1], cv2.IMREAD_COLOR)
@@ -145,12 +134,9 @@ class Imperfections:
 def _streak(length: float, angle: float) -> NDArray[np.float32]:
     """A kernel that spreads a point over a line [pixels, rad]."""
     half = math.ceil(length / 2) + 1
-    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    for along in np.linspace(-length / 2, length / 2, 8 * half + 1):
-        x, y = half + along * math.cos(angle), half + along * math.sin(angle)
-        column, row = math.floor(x), math.floor(y)
-        right, down = x - column, y - row
-        kernel[row : row + 2, column : column + 2] += np.outer(
-            (1 - down, down), (1 - right, right)
-        )
+    row = np.clip((length + 1) / 2 - np.abs(np.arange(-half, half + 1)), 0, 1)
+    level = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    level[half] = row
+    turn = cv2.getRotationMatrix2D((half, half), math.degrees(angle), 1.0)
+    kernel = np.asarray(cv2.warpAffine(level, turn, level.shape), np.float32)
     return kernel / kernel.sum()

@@ -1,14 +1,14 @@
-"""Record episodes with videos as LeRobot does, with its own writer."""
+"""Record episodes with videos by LeRobot's own writer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_env_bimanual.eyes.rig import IMAGES
@@ -17,15 +17,27 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.cell import write_cell
 
-__all__ = ["CODECS", "Recorder"]
+__all__ = ["CODECS", "recording", "row"]
 
 #: What pictures are stored as: LeRobot's own choice, the other usual codec, no video.
 CODECS = {"av1": "libsvtav1", "h264": "h264", "pictures": None}
 CELL = "cell.json"
 
 
-class Recorder:
-    """A LeRobot data set that is being recorded, with a cell file in it.
+@contextmanager
+def recording(
+    path: str | Path,
+    fps: int,
+    joint_names: Sequence[str],
+    cameras: Mapping[str, tuple[int, int]],
+    cell: Mapping[str, Any],
+    *,
+    objects: Sequence[str] = (),
+    units: Sequence[str] | None = None,
+    robot_type: str | None = None,
+    codec: str = "av1",
+) -> Iterator[Any]:
+    """Open a LeRobot data set for recording, with a cell file in it.
 
     It takes the place of ``path`` when the block ends, as a whole or not at all.
 
@@ -48,135 +60,84 @@ class Recorder:
     robot_type : str, optional
     codec : {"av1", "h264", "pictures"}, default="av1"
 
+    Yields
+    ------
+    LeRobotDataset
+        Its ``add_frame`` takes what :func:`row` makes, ``save_episode`` ends an episode,
+        ``clear_episode_buffer`` forgets one.
+
     Raises
     ------
     DataError
-        If the folder exists, or the codec is another.
+        If the folder exists, the codec is another, or no episode was saved.
 
     Examples
     --------
     ::
 
-        with Recorder("set", 25, names, {"front": (640, 480)}, rig.content()) as recorder:
-            for row in rows:
-                recorder.add(row.joints, row.reference, rig.pictures(rng), "shake the bottle")
-            recorder.save()
+        with recording("set", 25, names, {"front": (640, 480)}, rig.content()) as opened:
+            for joints, reference in motion:
+                pictures = rig.pictures(rng)
+                opened.add_frame(row("shake the bottle", joints, reference, pictures))
+            opened.save_episode()
     """
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
 
-    def __init__(
-        self,
-        path: str | Path,
-        fps: int,
-        joint_names: Sequence[str],
-        cameras: Mapping[str, tuple[int, int]],
-        cell: Mapping[str, Any],
-        *,
-        objects: Sequence[str] = (),
-        units: Sequence[str] | None = None,
-        robot_type: str | None = None,
-        codec: str = "av1",
-    ) -> None:
-        if codec not in CODECS:
-            raise DataError(f"a codec is one of {list(CODECS)}, got {codec!r}")
-        self.path, self.fps, self.cell = Path(path), int(fps), cell
-        self.robot_type, self.codec = robot_type, codec
-        names = list(joint_names)
-        units = ["rad"] * len(names) if units is None else list(units)
-        joints = {
-            "dtype": "float32", "shape": (len(names),), "names": names,
-            "info": {"units": units},
-        }  # fmt: skip
-        kind = "image" if CODECS[codec] is None else "video"
-        self._features: dict[str, Any] = {"observation.state": joints, "action": joints}
-        for name, (width, height) in cameras.items():
-            self._features[IMAGES + name] = {
-                "dtype": kind,
-                "shape": (height, width, 3),
-                "names": ["height", "width", "channels"],
-            }
-        if objects:
-            poses = with_frames(None, list(objects))
-            self._features["observation.environment_state"] = {
-                **poses, "shape": tuple(poses["shape"]),
-            }  # fmt: skip
-        self.episodes = self._rows = 0
+    if codec not in CODECS:
+        raise DataError(f"a codec is one of {list(CODECS)}, got {codec!r}")
+    names, video = list(joint_names), CODECS[codec]
+    joints: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
+    units = ["rad"] * len(names) if units is None else list(units)
+    joints |= {"info": {"units": units}} if units else {}
+    features: dict[str, Any] = {OBS_STATE: joints, ACTION: joints}
+    for name, (width, height) in cameras.items():
+        shape, axes = (height, width, 3), ["height", "width", "channels"]
+        kind = "video" if video else "image"
+        features[IMAGES + name] = {"dtype": kind, "shape": shape, "names": axes}
+    if objects:
+        poses = with_frames(None, list(objects))
+        features[OBS_ENV_STATE] = {**poses, "shape": tuple(poses["shape"])}
+    with replacing(path) as new:
+        if Path(path).exists():
+            raise DataError(f"{path} exists: remove it, or give another folder")
+        opened = LeRobotDataset.create(
+            f"local/{Path(path).name}", fps, features, root=new, robot_type=robot_type,
+            use_videos=video is not None, streaming_encoding=video is not None,
+            rgb_encoder=video and RGBEncoderConfig(vcodec=video),
+            encoder_queue_maxsize=0,  # what a full queue does not take would be dropped
+        )  # fmt: skip
+        try:
+            yield opened
+        finally:
+            if opened.has_pending_frames():
+                opened.clear_episode_buffer()
+            opened.finalize()
+        if not opened.num_episodes:
+            raise DataError(f"no episode was saved: there is no {path}")
+        write_cell(cell, new / CELL)
 
-    def __enter__(self) -> Self:
-        from lerobot.configs.video import RGBEncoderConfig
-        from lerobot.datasets import LeRobotDataset
 
-        with ExitStack() as stack:
-            new = stack.enter_context(replacing(self.path))
-            if self.path.exists():
-                raise DataError(f"{self.path} exists: remove it, or give another folder")
-            codec = CODECS[self.codec]
-            self._set: Any = LeRobotDataset.create(
-                f"local/{self.path.name}",
-                self.fps,
-                self._features,
-                root=new,
-                robot_type=self.robot_type,
-                use_videos=codec is not None,
-                rgb_encoder=codec and RGBEncoderConfig(vcodec=codec),
-                streaming_encoding=codec is not None,
-                encoder_queue_maxsize=0,  # what a full queue does not take would be dropped
-            )
-            self._new = new
-            self._closing = stack.pop_all()
-        return self
+def row(
+    task: str,
+    state: ArrayLike,
+    action: ArrayLike,
+    pictures: Mapping[str, NDArray[np.uint8]],
+    poses: ArrayLike | None = None,
+) -> dict[str, Any]:
+    """A row of a set that is being recorded.
 
-    def add(
-        self,
-        state: ArrayLike,
-        action: ArrayLike,
-        pictures: Mapping[str, NDArray[np.uint8]],
-        task: str,
-        poses: ArrayLike | None = None,
-    ) -> None:
-        """Add a row.
-
-        Parameters
-        ----------
-        state, action : array-like of shape (n_joints,)
-            Measured, and the reference for the end of the period, in the declared units.
-        pictures : mapping of str to ndarray of shape (height, width, 3)
-            RGB, by the names of the cameras.
-        task : str
-            What is done, in words.
-        poses : array-like of shape (7 * n_objects,), optional
-            Of the objects.
-        """
-        row: dict[str, Any] = {IMAGES + name: one for name, one in pictures.items()}
-        row |= {"observation.state": np.asarray(state, np.float32), "task": task}
-        row["action"] = np.asarray(action, np.float32)
-        if poses is not None:
-            row["observation.environment_state"] = np.asarray(poses, np.float32)
-        self._set.add_frame(row)
-        self._rows += 1
-
-    def save(self) -> None:
-        """End the episode, and keep it."""
-        self._set.save_episode()
-        self.episodes, self._rows = self.episodes + 1, 0
-
-    def discard(self) -> None:
-        """Forget the rows since the last episode."""
-        if self._rows:
-            self._set.clear_episode_buffer()
-            self._rows = 0
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with self._closing:
-            self.discard()
-            self._set.finalize()
-            if kind is None:
-                if not self.episodes:
-                    raise DataError(f"no episode was saved: there is no {self.path}")
-                write_cell(self.cell, self._new / CELL)
-            else:
-                raise error  # type: ignore[misc]
+    Parameters
+    ----------
+    task : str
+        What is done, in words.
+    state, action : array-like of shape (n_joints,)
+        Measured, and the reference for the end of the period, in the declared units.
+    pictures : mapping of str to ndarray of shape (height, width, 3)
+        RGB, by the names of the cameras.
+    poses : array-like of shape (7 * n_objects,), optional
+        Of the objects.
+    """
+    values = {OBS_STATE: state, ACTION: action, OBS_ENV_STATE: poses}
+    numbers = {k: np.asarray(v, np.float32) for k, v in values.items() if v is not None}
+    return {"task": task, **numbers, **{IMAGES + name: one for name, one in pictures.items()}}

@@ -23,8 +23,6 @@ __all__ = ["IMAGES", "Rig", "View", "looking"]
 
 #: How LeRobot names the features of cameras.
 IMAGES = "observation.images."
-#: How near to a point what is hit by a ray towards it is what the point is on [m].
-SURFACE = 0.002
 #: OpenCV's camera looks along z, y down; MuJoCo's along -z, y up.
 _TURNED = rigid(np.diag((1.0, -1.0, -1.0)), np.zeros(3))
 
@@ -50,7 +48,7 @@ def looking(eye: ArrayLike, at: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> A
     eye = np.asarray(eye, dtype=float)
     z = np.asarray(at, dtype=float) - eye
     z /= np.linalg.norm(z)
-    x = np.cross(z, up)
+    x = np.cross(z, np.asarray(up, dtype=float))
     x /= np.linalg.norm(x)
     return rigid(np.stack((x, np.cross(z, x), z), axis=1), eye)
 
@@ -98,34 +96,28 @@ class Rig:
         imperfections: Imperfections | None = None,
     ) -> None:
         self.scene, self.views, self.carriers = scene, dict(views), dict(carriers)
-        if objects is None:
-            objects = {body: body for body in carriers if body != "world"}
-        if checks is None:
-            checks = {"world": "base"} if "world" in carriers else {}
-        self.objects, self.checks = dict(objects), dict(checks)
+        self._renderer: Renderer | None = None
+        movable = {body: body for body in carriers if body != "world"}
+        self.objects = movable if objects is None else objects
+        self.checks = {"world": "base"} if checks is None else checks
         self.lens = Lens(camera or usual_camera())
         self.imperfections = imperfections or Imperfections()
         spec = scene.spec.copy()
         there = [body.name for body in spec.bodies]
-        links = [view.link for view in self.views.values() if view.link is not None]
-        named = {*self.carriers, *links, *self.objects, *self.checks}
-        if missing := named - {*there}:
-            raise DataError(f"the scene has no bodies {sorted(missing)}; it has {there}")
+        used = [*self.carriers, *(view.link or "world" for view in self.views.values())]
+        if missing := [body for body in used if body not in there]:
+            raise DataError(f"the scene has no bodies {missing}; it has {there}")
         for body, carrier in self.carriers.items():
             add_carrier(spec, body, carrier)
         for name, view in self.views.items():
-            place = pose_vector(view.pose @ _TURNED)
-            spec.body(view.link or "world").add_camera(
-                name=f"eye {name}", pos=place[:3], quat=place[3:], fovy=self.lens.fovy
-            )
+            place, mount = pose_vector(view.pose @ _TURNED), spec.body(view.link or "world")
+            seen = mount.add_camera(name=f"eye {name}", pos=place[:3], quat=place[3:])
+            seen.fovy = self.lens.fovy
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         # bodies are the same; those of their geoms that are tags come last
-        first, count = self._model.body_geomadr, scene.model.body_geomnum
-        self._geoms = np.concatenate(
-            [a + np.arange(n) for a, n in zip(first, count, strict=True)]
-        )
-        self._renderer: Renderer | None = None
+        pairs = zip(self._model.body_geomadr, scene.model.body_geomnum, strict=True)
+        self._geoms = np.concatenate([first + np.arange(n) for first, n in pairs])
 
     def pictures(self, rng: np.random.Generator) -> dict[str, NDArray[np.uint8]]:
         """What the cameras see now.
@@ -168,45 +160,26 @@ class Rig:
 
     def content(self) -> dict[str, Any]:
         """The true cell file of the scene, as :mod:`tpgmm_vision.cell` describes it."""
-        self._follow()
-        cameras = {
-            name: {
-                **camera_content(self.lens.camera, IMAGES + name),
-                "pose": pose_content(view.pose),
-                **({} if view.link is None else {"link": view.link}),
-            }
-            for name, view in self.views.items()
-        }
-        objects = {
-            name: {
-                "target": dict(self.carriers[body].entry),
-                "pose": pose_content(inverse(self.carriers[body].pose)),
-                **({"upright": True} if self.carriers[body].upright else {}),
-            }
-            for body, name in self.objects.items()
-        }
-        checks = {
-            name: {
-                "target": dict(self.carriers[body].entry),
-                "pose": pose_content(self.pose(body) @ self.carriers[body].pose),
-            }
-            for body, name in self.checks.items()
-        }
+        cameras, objects, checks = (dict[str, dict[str, Any]]() for _ in range(3))
+        for name, view in self.views.items():
+            cameras[name] = camera_content(self.lens.camera, IMAGES + name)
+            cameras[name] |= {"pose": pose_content(view.pose)}
+            cameras[name] |= {} if view.link is None else {"link": view.link}
+        for body, carrier in self.carriers.items():
+            target = {"target": dict(carrier.entry)}
+            if body in self.objects:
+                pose = {"pose": pose_content(inverse(carrier.pose))}
+                known = {"upright": True} if carrier.upright else {}
+                objects[self.objects[body]] = target | pose | known
+            elif body in self.checks:
+                pose = {"pose": pose_content(self.pose(body) @ carrier.pose)}
+                checks[self.checks[body]] = target | pose
         return {"cameras": cameras, "objects": objects, "checks": checks}
 
     def camera_pose(self, camera: str) -> Array:
         """Where a camera is in the world (4, 4)."""
         view = self.views[camera]
         return view.pose if view.link is None else self.pose(view.link) @ view.pose
-
-    def in_sight(self, camera: str, point: ArrayLike) -> bool:
-        """Whether nothing hides a point (3,) of the camera's frame, but what it is on [m]."""
-        self._follow()
-        pose, point = self.camera_pose(camera), np.asarray(point, dtype=float)
-        distance, hit = float(np.linalg.norm(point)), np.zeros(1, np.int32)
-        ray = pose[:3, :3] @ point / distance
-        found = mujoco.mj_ray(self._model, self._data, pose[:3, 3], ray, None, 1, -1, hit)
-        return found < 0 or found > distance - SURFACE
 
     def pose(self, body: str) -> Array:
         """Where a body is (4, 4)."""

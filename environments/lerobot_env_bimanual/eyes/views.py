@@ -38,10 +38,11 @@ def around(centre: ArrayLike, distance: float, azimuth: float, elevation: float)
     return View(looking(np.asarray(centre) + distance * away, centre))
 
 
-#: Two cameras opposite the robot, to its left and to its right.
+#: Two cameras opposite the robot, to its left and to its right. On 640 pixels, cubes of 40 mm
+#: tags are found everywhere on the table from 0.9 m; from 1 m some that are turned badly not.
 VIEWS: Mapping[str, View] = {
-    "front": around(CENTRE, 1.0, 25.0, 35.0),
-    "side": around(CENTRE, 1.0, -45.0, 40.0),
+    "front": around(CENTRE, 0.9, 25.0, 35.0),
+    "side": around(CENTRE, 0.9, -45.0, 40.0),
 }
 
 
@@ -58,8 +59,7 @@ def chosen_views(cameras: str | Sequence[str]) -> dict[str, View]:
     UnknownNameError
         If there is no such camera.
     """
-    names = re.split(r"[\s,\[\]'\"]+", cameras) if isinstance(cameras, str) else cameras
-    names = [name for name in names if name]
+    names = re.findall(r"[\w.-]+", cameras) if isinstance(cameras, str) else cameras
     for name in names:
         if name not in VIEWS:
             raise UnknownNameError("camera", name, "the environments", VIEWS)

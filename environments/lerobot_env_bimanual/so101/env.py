@@ -15,7 +15,6 @@ from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course, displaced
 from lerobot_env_bimanual.eyes.carriers import cube_at
-from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import around
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
 from lerobot_env_bimanual.so101.kinematics import Reach
@@ -108,6 +107,7 @@ class BiSo101Env(ControlledEnv):
     checks: ClassVar = CHECKS
     carriers: ClassVar = CARRIERS
     units: ClassVar = ()
+    suffix: ClassVar = ".pos"
     robot_type: ClassVar = "bi_so_follower"
     _scene: BiSo101Scene
 
@@ -142,19 +142,15 @@ class BiSo101Env(ControlledEnv):
         """The simulated world, which an expert sees."""
         return self._scene
 
-    @property
-    def recorded_names(self) -> list[str]:
-        """As LeRobot's ``bi_so_follower`` calls its motors."""
-        return [f"{name}.pos" for name in self.joint_names]
-
     def stored(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
         return np.asarray((joints - self._zero) / self._factor)
 
-    def cell(self, rig: Rig | None = None) -> dict[str, Any]:
-        """The true cell file of the environment with its cameras, with the offsets."""
+    def cell_of_joints(self) -> dict[str, Any]:
+        """What a cell file says of the joints, with the true offsets."""
         pairs = zip(self.joint_names, self.offsets.tolist(), strict=True)
-        return {**super().cell(rig), "joint_offsets": {name: off for name, off in pairs if off}}
+        offsets = {name: offset for name, offset in pairs if offset}
+        return {**super().cell_of_joints(), "joint_offsets": offsets}
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far."""

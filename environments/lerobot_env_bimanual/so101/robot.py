@@ -18,8 +18,8 @@ BACKLASH = math.radians(0.4)
 #: What the joint behind a motor is called.
 PLAY = "_play"
 #: A servo STS3215: stiffness [N m / rad], so soft that gravity bends each of the joints that
-#: carry the stretched arm by up to 2 degrees; damping [N m s / rad], friction and largest torque [N m], and the
-#: inertia of its rotor behind the gears [kg m^2].
+#: carry the stretched arm by up to 2 degrees; damping [N m s / rad], friction and largest torque
+#: [N m], and the inertia of its rotor behind the gears [kg m^2].
 STIFFNESS, DAMPING, FRICTION, TORQUE, ROTOR = 17.8, 0.6, 0.05, 3.0, 0.028
 #: Largest torque of the gripper, that of LeRobot's settings (half of the others') [N m].
 GRIP_TORQUE = 1.0
@@ -54,8 +54,8 @@ def so101_spec() -> mujoco.MjSpec:
     -------
     mujoco.MjSpec
         A joint NAME is where the motor is, as its encoder measures; NAME_play behind it is free
-        within the backlash. Geoms ``l_jaw``, ``l_palm`` (the fixed jaw) and the right ones touch
-        what has the bit ``PALM``.
+        within the backlash. Geoms ``l_jaw``, ``l_palm`` (the fixed jaw) and the right ones
+        touch what has the bit ``PALM``.
     """
     spec = mujoco.MjSpec.from_string(bi_so101_urdf())
     spec.compiler.fusestatic = spec.compiler.discardvisual = False

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lerobot_env_bimanual.eyes.calibration import calibration_episode, varied_postures
 from lerobot_env_bimanual.eyes.carriers import cube_at
-from lerobot_env_bimanual.eyes.recorder import Recorder
+from lerobot_env_bimanual.eyes.recorder import recording
 from lerobot_env_bimanual.so101.env import CHECKS, BiSo101Env
 from lerobot_env_bimanual.so101.robot import SIDES, hand_of
 from lerobot_env_bimanual.so101.scene import CUBE, LEFT, TAG
@@ -69,18 +70,15 @@ def record_waving(
         [varied_postures(rig, hand_of(side), n, rng)[:, PARTS[side]] for side in SIDES],
         axis=1,
     )
-    recorder = Recorder(
-        out,
-        fps,
-        env.recorded_names,
+    names, sizes = (
+        [name + env.suffix for name in env.joint_names],
         dict.fromkeys(rig.views, size),
-        env.cell(rig),
-        units=env.units,
-        robot_type=env.robot_type,
-        codec=codec,
     )
-    with recorder:
-        calibration_episode(recorder, rig, postures, rng, env.stored, env.stored)
+    cell = {**rig.content(), **env.cell_of_joints()}
+    settings: dict[str, Any] = {"units": env.units, "robot_type": env.robot_type}
+    with recording(out, fps, names, sizes, cell, codec=codec, **settings) as opened:
+        for row in calibration_episode(rig, postures, fps, rng, env.stored, env.stored):
+            opened.add_frame(row)
+        opened.save_episode()
     rig.close()
-    env.close()
     return Path(out)

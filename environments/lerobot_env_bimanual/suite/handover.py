@@ -64,7 +64,7 @@ class Handover(SuiteTask):
     }  # fmt: skip
     carriers: ClassVar = {
         "baton": cube_at(10, z=FOOT + CUBE_ROOM),
-        "stand": flat_at(20, 0.09, z=0.001),
+        "stand": flat_at(20, 0.09, 0.001),
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)

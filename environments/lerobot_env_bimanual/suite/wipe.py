@@ -78,7 +78,7 @@ class Wipe(SuiteTask):
         "reach": 2.0, "close": 1.5, "press": 1.2, "wipe": 6.0, "lift": 1.0, "away": 1.5,
         "rest": 0.4,
     }  # fmt: skip
-    carriers: ClassVar = {"board": flat_at(10, BOARD[0] + 0.04, upright=False)}
+    carriers: ClassVar = {"board": flat_at(10, BOARD[0] + 0.04, 0.0, upright=False)}
     grasp, box = "close", AREA
     #: Nobody carries a board that stands fast.
     holds = ()

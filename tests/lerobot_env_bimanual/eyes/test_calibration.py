@@ -30,7 +30,8 @@ def test_the_joints_that_move_a_link_are_those_of_its_chain(env):
     assert moved == [name for name in env.joint_names if not name.startswith("l_")]
 
 
-def test_all_postures_show_the_tags_and_turn_the_hand_about_all_axes(env):
+def test_all_postures_show_the_tags_and_turn_the_hand_about_all_axes(env, monkeypatch):
+    monkeypatch.setattr(calibration, "DRAWN", 3000)
     rig = env.rig("front", carriers=TAGS, objects={})
     before = env._scene.joints
     postures = varied_postures(rig, "r_hand", 8, np.random.default_rng(0))

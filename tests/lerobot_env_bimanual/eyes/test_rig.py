@@ -54,11 +54,11 @@ def rms_of_corners(rig, picture, camera):
 def test_tags_are_seen_where_they_are(task):
     env = TASKS[task](fps=25, cameras="front,side")
     observation, _ = env.reset(seed=3)
-    rig, numbers = env._rig, set()
+    rig, numbers = env.eyes, set()
     for camera, picture in observation["pixels"].items():
         assert picture.shape == (480, 640, 3)
         apart = rms_of_corners(rig, picture, camera)
-        assert max(apart.values()) < 0.3 and np.median(list(apart.values())) < 0.12
+        assert max(apart.values()) < 1.0 and np.median(list(apart.values())) < 0.05
         numbers |= set(apart)
     for body, carrier in rig.carriers.items():
         assert numbers & set(carrier.target.corners), f"no tag of {body} is seen"
@@ -73,7 +73,7 @@ def test_the_cell_is_that_of_the_scene_and_what_is_estimated_is_there():
     assert list(cell.cameras) == ["side", "front"]
     poses = observation["environment_state"].reshape(-1, 7)
     for (name, thing), true in zip(cell.objects.items(), poses, strict=True):
-        target = env.unwrapped._rig.carriers[name].pose
+        target = env.unwrapped.eyes.carriers[name].pose
         np.testing.assert_allclose(target @ thing.pose, np.eye(4), atol=1e-6)
         assert thing.upright == (name == "tray")
         assert np.isfinite(true).all()
@@ -196,22 +196,10 @@ def test_what_is_moved_in_the_model_is_moved_in_the_picture():
     rig.close()
 
 
-def test_what_is_hidden_is_not_in_sight():
-    env = SuiteEnv("lid", fps=25)
-    env.reset(seed=0)
-    rig = env.rig("front")
-    camera_from_base = inverse(rig.camera_pose("front"))
-    box, carrier = rig.pose("box"), rig.carriers["box"]
-    front = transformed(camera_from_base @ box @ carrier.pose, carrier.target.corners[10])
-    assert rig.in_sight("front", front.mean(axis=0))
-    [behind] = transformed(camera_from_base @ box, [[-0.05, 0.0, 0.0]])
-    assert not rig.in_sight("front", behind)
-
-
 def test_bodies_that_are_not_there_are_named():
     env = BottleShakingEnv(fps=25)
     with pytest.raises(DataError, match=r"no bodies \['cup'\].*bottle"):
-        Rig(env._scene, dict(VIEWS), {"cup": flat_at(3)})
+        Rig(env._scene, dict(VIEWS), {"cup": flat_at(3, 0.1, 0.0)})
 
 
 def test_where_nothing_can_be_drawn_that_is_an_error(monkeypatch):

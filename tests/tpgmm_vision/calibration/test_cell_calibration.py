@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.simulated_cells import (
-    CUBE, HAND, SimulatedCell, robot_named, so101_cell, two_arm_cell, wrist_cell,
+    CUBE,
+    HAND,
+    SimulatedCell,
+    robot_named,
+    so101_cell,
+    two_arm_cell,
+    wrist_cell,
 )  # fmt: skip
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_vision.calibration.cell_calibration import Mount, calibrate_cell

@@ -42,7 +42,7 @@ def test_what_is_missing_is_said(eye, pictures):
     frontal = eye.pictures(9, rng, tilt=(0, 3))
     with pytest.raises(DataError, match=r"do not tell the focal length .* differ by . deg"):
         calibrate_camera(frontal, Board())
-    with pytest.raises(DataError, match=r"% of the picture, .* near the edges"):
+    with pytest.raises(DataError, match=r"of the picture.s 4 x 4 fields, .* near the edges"):
         calibrate_camera(dict.fromkeys("abcdefgh", eye.picture(eye.pose(rng), rng)), Board())
 
 

@@ -91,6 +91,8 @@ def check(
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
+    if description.tracked:
+        typer.echo(f"tracked: {_tracked(description)}")
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
@@ -353,8 +355,16 @@ def _summary(description: DatasetInfo) -> dict[str, object]:
         "joints": description.joints or "not found",
         "frames": ", ".join(description.frames) or "none found",
         "events": ", ".join(description.events) or "none found",
+        "tracked": _tracked(description),
         "problems": len(description.problems) or "none",
     }
+
+
+def _tracked(description: DatasetInfo) -> str:
+    """How often objects were seen in the pictures."""
+    shares = description.tracked.items()
+    found = [f"{name} seen in {a:.0%}, known in {b:.0%} of all rows" for name, (a, b) in shares]
+    return ", ".join(found) or "none"
 
 
 def _rows(column: ColumnInfo) -> Iterator[tuple[str, str, str, str, str, str]]:

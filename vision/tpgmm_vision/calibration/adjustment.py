@@ -1,4 +1,4 @@
-"""Bundle adjustment: the state that explains what is seen, and how noisy corners and joints are.
+"""Bundle adjustment: the state that explains what is seen, and the noise of corners and joints.
 
 The noise of the joints is integrated out to first order: corners of one posture err together.
 """
@@ -97,7 +97,7 @@ def adjust(
         Whether tags count less that do not fit.
     """
     corners, found, last = problem.corners, noise or Noise(), np.inf
-    weights = np.ones(len(corners.pixels))
+    weights: Array = np.ones(len(corners.pixels))
     for _ in range(ROUNDS):
         whitening = _whitening(problem, state, found, weights)
 

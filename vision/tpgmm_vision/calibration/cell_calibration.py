@@ -45,7 +45,7 @@ LEAST_STEP = 0.003, np.radians(0.5)
 HARDLY = np.radians(15.0)
 #: By how much the logarithm of the likelihood must rise for a cause to be believed: of a scale,
 #: and of a pose that changed on the way, which can do so at any picture.
-SCALE_EVIDENCE, STEP_EVIDENCE = 6.0, 25.0
+SCALE_EVIDENCE, STEP_EVIDENCE = 8.0, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,8 @@ class CellCalibration:
         ]
         if self.unknown:
             lines.append(
-                f"not known from these postures, poses make up for them: {', '.join(self.unknown)}"
+                "not known from these postures, poses make up for them: "
+                f"{', '.join(self.unknown)}"
             )
         return "\n".join(lines)
 
@@ -149,7 +150,7 @@ def calibrate_cell(
         Tags in hands, and those that stand still, by name.
     bases : sequence of str, default=()
         Beginnings of the names of links and joints of arms whose base is not known, such as
-        "right_".
+        ``"right_"``.
 
     Raises
     ------
@@ -283,11 +284,13 @@ class _Task:
     ) -> tuple[Array, Array]:
         """Poses of a camera in its carrier, and of a target in the hand."""
         found = list[tuple[float, Array, Array]]()
-        pairs = [one[:, :3, columns] for one in (hand_from_carrier, camera_from_target)
-                 for columns in (slice(3), 3)]  # fmt: skip
+        hand, seen = hand_from_carrier[:, :3], camera_from_target[:, :3]
         for method in CLOSED_FORMS:
             with suppress(cv2.error):
-                turn, place = cv2.calibrateHandEye(*pairs, method=method)
+                turn, place = cv2.calibrateHandEye(
+                    [*hand[..., :3]], [*hand[..., 3]], [*seen[..., :3]], [*seen[..., 3]],
+                    method=method,
+                )  # fmt: skip
                 if np.isfinite(place).all() and np.linalg.det(turn) > 0.5:
                     poses = hand_from_carrier @ rigid(turn, place) @ camera_from_target
                     target, _ = mean_pose(poses)
@@ -319,9 +322,9 @@ class _Task:
         moved_by, turned = np.linalg.norm(step[:3, 3]), angle_between(np.eye(4), step)
         if gain > STEP_EVIDENCE and (moved_by > LEAST_STEP[0] or turned > LEAST_STEP[1]):
             raise DataError(
-                f"{'camera' if part < len(self.cameras) else 'target'} {names[part]!r} was moved "
-                f"by {1e3 * moved_by:.0f} mm and {np.degrees(turned):.1f} deg at picture {at} of "
-                f"{len(problem.joints)}: fix it, and record all pictures again"
+                f"{'camera' if part < len(self.cameras) else 'target'} {names[part]!r} was "
+                f"moved by {1e3 * moved_by:.0f} mm and {np.degrees(turned):.1f} deg at picture "
+                f"{at} of {len(problem.joints)}: fix it, and record all pictures again"
             )
 
     def check_known(self, fit: Adjustment) -> None:
@@ -329,17 +332,17 @@ class _Task:
         problem, pairs = fit.problem, list(self.views)
         shape = ELSEWHERE, problem.robot.n_joints
         away = np.random.default_rng(0).uniform(-LIKELY_REACH, LIKELY_REACH, shape)
-        at, nothing = np.tile(np.arange(ELSEWHERE), len(pairs)), np.zeros((3, 1))
-        nothing = np.zeros((len(at), 3))
-        corners = Corners(nothing[:, :2], nothing, at, *np.repeat(pairs, ELSEWHERE, 0).T, at)
+        at, (i, j) = np.tile(np.arange(ELSEWHERE), len(pairs)), np.repeat(pairs, ELSEWHERE, 0).T
+        middles = np.zeros((len(at), 3))
+        corners = Corners(middles[:, :2], middles, at, i, j, at)
         other = replace(problem, joints=problem.joints.mean(0) + away, corners=corners)
         _, _, seen = other.expected(fit.state)
         errors = np.einsum("nij,jk,nik->n", seen, fit.covariance(), seen) ** 0.5
         expected = np.median(errors.reshape(len(pairs), -1), axis=1)
         if (worst := float(expected.max())) > LARGEST_EXPECTED:
             raise DataError(
-                f"{self._missing(*pairs[int(expected.argmax())])}: elsewhere what the hand holds "
-                f"may be {1e3 * worst:.0f} mm from where it is seen"
+                f"{self._missing(*pairs[int(expected.argmax())])}: elsewhere what the hand "
+                f"holds may be {1e3 * worst:.0f} mm from where it is seen"
             )
 
     def _missing(self, i: int, j: int) -> str:
@@ -359,8 +362,8 @@ class _Task:
         still = [f"{problem.robot.joint_names[k]} ({np.degrees(moved[k]):.0f} deg)"
                  for k in np.flatnonzero(movers)]  # fmt: skip
         return (
-            f"{len(used)} postures of {self.mounts[j]!r} before {self.cameras[i]!r} are too few "
-            "or too similar"
+            f"{len(used)} postures of {self.mounts[j]!r} before {self.cameras[i]!r} are too "
+            "few or too similar"
             + (f", without rotation about {' and '.join(lacking)}" if lacking else "")
             + (f"; turn {', '.join(still)} by 45 deg and more" if still
                else "; take 30, in which all joints differ by 45 deg and more")
@@ -380,8 +383,8 @@ class _Task:
                 "one with a ruler"
                 if number == len(self.cameras)
                 else f"the focal length of camera {self.cameras[number]!r} is {amount} too "
-                f"{'small' if value > 0 else 'large'}: calibrate it again, by pictures that are "
-                "not cropped or scaled"
+                f"{'small' if value > 0 else 'large'}: calibrate it again, by pictures that "
+                "are not cropped or scaled"
             )
             found.append((fit.surprise - other.surprise, text))
         best = max(found)[0]
@@ -459,8 +462,8 @@ def _check(
             raise DataError(f"camera {name!r} has {len(found)} pictures for {len(joints)} rows")
         for posture, one in enumerate(found):
             if one.twice:
-                raise DataError(f"camera {name!r} sees tags {sorted(one.twice)} twice in picture "
-                                f"{posture}: cover or remove the others")  # fmt: skip
+                raise DataError(f"camera {name!r} sees tags {sorted(one.twice)} twice in "
+                                f"picture {posture}: cover or remove the others")  # fmt: skip
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tpgmm_torch.exceptions import DataError
+from tpgmm_vision.calibration.recorded import spread
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.poses import Array
@@ -37,7 +38,7 @@ SQUARE = 0.005
 
 #: Half a window in which a corner is refined, as a share of its distance to the next tag.
 WINDOW = 0.9
-SUBPIXEL = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-4
+ENDS = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-6
 
 Views = Mapping[str, tuple[Array, Array]]
 
@@ -66,8 +67,8 @@ class CameraCalibration:
         fx, fy = self.camera.focal_length
         return (
             f"focal length {fx:.1f}, {fy:.1f} pixels; error on pictures left out "
-            f"{self.pixel_error:.2f} pixels, {2e3 * self.pixel_error / (fx + fy):.2f} mm at 1 m; "
-            f"from {len(self.pictures)} pictures"
+            f"{self.pixel_error:.2f} pixels, {2e3 * self.pixel_error / (fx + fy):.2f} mm at 1 "
+            f"m; from {len(self.pictures)} pictures"
         )
 
 
@@ -94,26 +95,26 @@ def calibrate_camera(
     views, without = _views(pictures, board)
     if len(views) < LEAST_PICTURES:
         raise DataError(
-            f"{len(views)} of {len(pictures)} pictures show the board, {LEAST_PICTURES} are needed "
-            f"and 20 are good; there is none in {without}: are columns, rows and family those of "
-            "the print, and is it flat, whole, sharp and lit evenly?"
+            f"{len(views)} of {len(pictures)} pictures show the board, {LEAST_PICTURES} are "
+            f"needed, 20 are good; there is none in {without}: are columns, rows and family "
+            "those of the print, and is it flat, whole, sharp and lit evenly?"
         )
     size = next(iter(sizes.values()))
     _check_covered(views, size)
     fixed = cv2.CALIB_FIX_K3
-    _, worst = _fitted(views, size, fixed)[:2]
+    worst = _fitted(views, size, fixed)[1]
     blurred = [n for n, e in worst.items() if e > BLURRED * np.median([*worst.values()])]
     views = {name: view for name, view in views.items() if name not in blurred}
     errors = {flags: _left_out(views, size, flags) for flags in (fixed, 0)}
     flags = 0 if errors[0] < HELPS * errors[fixed] else fixed
     camera, _, turns, uncertain = _fitted(views, size, flags)
     sides = Rotation.from_rotvec(turns).as_matrix()[:, :, 2]
-    tilt = float(np.sqrt(np.mean(np.sum((sides - sides.mean(0)) ** 2, axis=1))))
+    tilt = float(np.sqrt(sides.var(axis=0).sum()))
     if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
         raise DataError(
-            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the board is "
-            f"seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it by 30 deg "
-            "and more to the left, to the right, up and down"
+            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the "
+            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it "
+            "by 30 deg and more to the left, to the right, up and down"
         )
     problems = []
     if without or blurred:
@@ -145,28 +146,21 @@ def _views(
         window = int(np.clip(between[between > 0].min() * share, 2, 10))
         # OpenCV's board corners lie half a pixel to the right and below
         start = np.ascontiguousarray(corners - np.float32(0.5))
-        pixels = cv2.cornerSubPix(image, start, (window, window), (-1, -1), SUBPIXEL)
+        pixels = cv2.cornerSubPix(image, start, (window, window), (-1, -1), ENDS)
         found[name] = points.reshape(-1, 3), pixels.reshape(-1, 2)
-    if len(found) > MOST_PICTURES:
-        found = _most_different(found)
-    return found, without
+    names, away = list(found), np.array([_corners_of(*view) for view in found.values()])
+    chosen = (
+        spread(away, MOST_PICTURES, 0.0) if len(found) > MOST_PICTURES else range(len(names))
+    )
+    return {names[k]: found[names[k]] for k in chosen}, without
 
 
-def _most_different(views: dict[str, tuple[Array, Array]]) -> dict[str, tuple[Array, Array]]:
-    """Views whose homographies differ most, one after another."""
-    corner = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]).T
-    names, places = list(views), []
-    for points, pixels in views.values():
-        extent = np.ptp(points[:, :2], axis=0).max()
-        plane, _ = cv2.findHomography(points[:, :2] / extent, pixels)
-        seen = plane @ corner
-        places.append((seen[:2] / seen[2]).ravel())
-    chosen, table = [0], np.array(places)
-    distance = np.linalg.norm(table - table[0], axis=1)
-    while len(chosen) < MOST_PICTURES:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(table - table[chosen[-1]], axis=1))
-    return {names[k]: views[names[k]] for k in sorted(chosen)}
+def _corners_of(points: Array, pixels: Array) -> Array:
+    """Where the corners of a square on the board are in the picture (8,) [pixels]."""
+    extent = np.ptp(points[:, :2], axis=0).max()
+    plane, _ = cv2.findHomography(points[:, :2] / extent, pixels)
+    seen = plane @ np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]).T
+    return np.asarray((seen[:2] / seen[2]).ravel())
 
 
 def _check_covered(views: Views, size: Sequence[int]) -> None:
@@ -175,14 +169,16 @@ def _check_covered(views: Views, size: Sequence[int]) -> None:
     fields = np.minimum(pixels / size * FIELDS, FIELDS - 1).astype(int).clip(0)
     covered = np.zeros((FIELDS, FIELDS), dtype=bool)
     covered[fields[:, 1], fields[:, 0]] = True
+    sides = covered[0], covered[-1], covered[:, 0], covered[:, -1]
+    names = "top", "bottom", "left", "right"
+    bare = [
+        name for name, side in zip(names, sides, strict=True) if side.sum() < FIELDS / 2
+    ] or ["the corners"]
     if covered.sum() < LEAST_COVERED:
-        sides = {"top": covered[0], "bottom": covered[-1], "left": covered[:, 0],
-                 "right": covered[:, -1]}  # fmt: skip
-        bare = [name for name, side in sides.items() if side.sum() < FIELDS / 2]
         raise DataError(
-            f"the board was seen in {100 * covered.mean():.0f} % of the picture, "
-            f"{100 * LEAST_COVERED / FIELDS**2:.0f} % are needed: take pictures in which it is near "
-            f"the edges{': ' if bare else ''}{', '.join(bare)}"
+            f"the board was seen in {covered.sum()} of the picture's {FIELDS} x {FIELDS} "
+            f"fields, {LEAST_COVERED} are needed: take pictures of it near the edges: "
+            f"{', '.join(bare)}"
         )
 
 
@@ -191,7 +187,9 @@ def _fitted(
 ) -> tuple[Camera, dict[str, float], Array, float]:
     """Camera, error of each picture [pixels], rotations, and the share of f that is unsure."""
     points, pixels = ([part[k] for part in views.values()] for k in (0, 1))
-    found: Any = cv2.calibrateCameraExtended(points, pixels, size, None, None, flags=flags)
+    found: Any = cv2.calibrateCameraExtended(
+        points, pixels, size, None, None, flags=flags, criteria=ENDS
+    )
     _, matrix, lens, turns, _, spread, _, errors = found
     camera = Camera(
         int(size[0]), int(size[1]), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]),

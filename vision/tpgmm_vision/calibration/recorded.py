@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import av
@@ -10,39 +10,56 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
+from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.reader import Recording
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.episodes.video import EpisodePictures, Picture
 from tpgmm_vision.poses import Array
 
-__all__ = ["board_pictures", "slow_postures"]
+__all__ = ["board_pictures", "slow_postures", "spread"]
 
-#: Pictures of a video that are looked at, and postures of a recording.
-FRAMES, POSTURES = 200, 60
+#: Pictures of a video that are looked at, and postures of a recording; of so many at least the
+#: robot may move faster than it should.
+FRAMES, POSTURES, LEAST_POSTURES = 200, 60, 15
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
 SLOW = 0.2
 #: Joints nearer to one another are the same posture [rad].
-SAME = np.radians(2.0)
+SAME = float(np.radians(2.0))
 
 
-def board_pictures(source: Path) -> dict[str, NDArray[np.uint8]]:
-    """Grey pictures by name: of a folder, or evenly of a video.
+def board_pictures(
+    source: Path, key: str, recording: Recording | None = None
+) -> dict[str, Picture]:
+    """Grey pictures by name: all of a folder, or evenly those of a video or a data set.
+
+    Parameters
+    ----------
+    source : Path
+        A folder of pictures or a video.
+    key : str
+        The camera's feature in a data set.
+    recording : Recording, optional
+        The data set, if it is one.
 
     Raises
     ------
     DataError
         If there are none.
     """
-    found = dict[str, NDArray[np.uint8]]()
-    if source.is_dir():
-        for file in sorted(source.iterdir()):
-            picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            if picture is not None:
-                found[file.name] = picture
+    found = dict[str, Picture]()
+    if recording is not None:
+        rows = _rows(recording)
+        reader = EpisodePictures(recording.assembly.layout, [key])
+        step = max(sum(len(one.time) for one in rows) // FRAMES, 1)
+        for one in rows:
+            for k, images in enumerate(reader.read(one.episode, one.time)):
+                if k % step == 0:
+                    found[f"episode {one.episode.index}, row {k}"] = grey(images[key])
+    elif source.is_dir():
+        read = ((file.name, cv2.imread(str(file), 0)) for file in sorted(source.iterdir()))
+        found = {name: picture for name, picture in read if picture is not None}
     else:
         try:
             with av.open(str(source)) as container:
@@ -57,20 +74,24 @@ def board_pictures(source: Path) -> dict[str, NDArray[np.uint8]]:
     return found
 
 
+def _rows(recording: Recording) -> list[EpisodeRows]:
+    """The rows of all episodes, without pictures."""
+    assembly = recording.assembly
+    return list(
+        read_episodes(assembly.layout, recording.episodes, assembly.features, Relaxed(()))
+    )
+
+
 def slow_postures(
-    recording: Recording,
-    cameras: Mapping[str, CellCamera],
-    progress: Callable[[int, int], None],
-    most: int = POSTURES,
-) -> tuple[Array, dict[str, list[Picture]]]:
-    """Joints and pictures where a robot moves slowly, at postures that differ most.
+    recording: Recording, keys: Mapping[str, str], most: int = POSTURES
+) -> tuple[Array, Iterator[tuple[int, dict[str, Picture]]]]:
+    """Postures where a robot moves slowly, those that differ most, and pictures there.
 
     Parameters
     ----------
     recording : Recording
-    cameras : mapping of str to CellCamera
-    progress : callable
-        Called with how many rows were read and how many there are.
+    keys : mapping of str to str
+        Features of cameras by their names.
     most : int, default=60
         Postures at most.
 
@@ -78,42 +99,43 @@ def slow_postures(
     -------
     joints : ndarray of shape (n, n_joints)
         [rad]
-    pictures : dict of str to list of n ndarray
-        By camera.
+    pictures : iterator of (int, dict)
+        The number of the posture, and pictures by the names of cameras.
     """
-    assembly, keys = recording.assembly, {name: one.key for name, one in cameras.items()}
+    assembly, rows = recording.assembly, _rows(recording)
     reader = EpisodePictures(assembly.layout, list(keys.values()))
-    rows = list(
-        read_episodes(assembly.layout, recording.episodes, assembly.features, Relaxed(()))
-    )
     tables = [assembly.demonstration(one).joints.double().numpy() for one in rows]
-    speeds = [
-        np.abs(np.gradient(table, one.time, axis=0)).max(1) if len(table) > 1 else np.zeros(1)
+    speed = np.concatenate([
+        np.abs(np.gradient(table, one.time, axis=0)).max(1) if len(table) > 1 else [0.0]
         for table, one in zip(tables, rows, strict=True)
-    ]
-    joints, speed = np.concatenate(tables), np.concatenate(speeds)
-    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[min(most, len(speed)) - 1]))
-    chosen = slow[spread(joints[slow], most)]
-    pictures: dict[str, list[Picture]] = {name: [] for name in cameras}
-    wanted, at = set(chosen.tolist()), 0
-    for one in rows:
-        last = max((k for k in wanted if k < at + len(one.time)), default=-1)
-        for k, images in enumerate(reader.read(one.episode, one.time), at):
-            progress(k + 1, len(joints))
-            if k in wanted:
-                for name, key in keys.items():
-                    pictures[name].append(images[key])
-            if k >= last:
-                break
-        at += len(one.time)
-    progress(len(joints), len(joints))
-    return joints[chosen], pictures
+    ])  # fmt: skip
+    joints = np.concatenate(tables)
+    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[: min(LEAST_POSTURES, most)][-1]))
+    chosen = slow[spread(joints[slow], most)].tolist()
+
+    def pictures() -> Iterator[tuple[int, dict[str, Picture]]]:
+        first = 0
+        for one in rows:
+            wanted = {k - first for k in chosen if first <= k < first + len(one.time)}
+            images = reader.read(one.episode, one.time) if wanted else iter(())
+            for k in range(max(wanted, default=-1) + 1):
+                shown = next(images)
+                if k in wanted:
+                    number = chosen.index(first + k)
+                    yield number, {name: shown[key] for name, key in keys.items()}
+            first += len(one.time)
+
+    return joints[chosen], pictures()
 
 
-def spread(points: Array, most: int) -> NDArray[np.int_]:
-    """Indices, in ascending order, of points (n, d) that are far from one another."""
-    chosen, distance = [0], np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < most and distance.max() > SAME:
+def spread(points: Array, most: int, same: float = SAME) -> NDArray[np.int_]:
+    """Indices, in ascending order, of points (n, d) that are far from one another.
+
+    Points nearer than ``same`` to one that was taken are not.
+    """
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < most and distance.max() > same:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.unique(chosen)

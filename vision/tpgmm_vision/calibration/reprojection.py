@@ -128,7 +128,8 @@ class Reprojection:
     def split(self, state: Array) -> tuple[Array, Array, Array]:
         """Poses (n_poses, 4, 4), offsets (n_joints,) and scales of a state."""
         poses, rest = np.split(state, [16 * self.n_poses])
-        return poses.reshape(-1, 4, 4), *np.split(rest, [self.robot.n_joints])
+        offsets, scales = np.split(rest, [self.robot.n_joints])
+        return poses.reshape(-1, 4, 4), offsets, scales
 
     def moved(self, state: Array, step: Array) -> Array:
         """A state after a step: poses of cameras and targets in their own axes."""

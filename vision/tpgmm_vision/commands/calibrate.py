@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import typer
+from rich.progress import Progress
 
 from tpgmm_tools.cli import options
 from tpgmm_torch.atomic import read_whole
@@ -58,29 +57,23 @@ def camera(
         Of a data set; default all.
     """
     from tpgmm_vision.calibration.intrinsics import calibrate_camera
-    from tpgmm_vision.calibration.recorded import FRAMES, board_pictures, slow_postures
-    from tpgmm_vision.cell import CellCamera, camera_content, write_cell
+    from tpgmm_vision.calibration.recorded import board_pictures
+    from tpgmm_vision.cell import camera_content, write_cell
     from tpgmm_vision.targets import Board
 
-    content, key = _content(cell), key or f"observation.images.{name}"
+    content, key, recording = _content(cell), key or f"observation.images.{name}", None
     if (pictures / "meta" / "info.json").exists():
-        recording = options.DataOptions(episodes=episodes, units=["raw"]).opened(
-            str(pictures), None, frames={}
-        )
-        with _progress("reading") as advance:
-            _, found = slow_postures(recording, {name: CellCamera(None, key)}, advance, FRAMES)
-        shown = {f"picture {k}": one for k, one in enumerate(found[name])}
-    else:
-        shown = board_pictures(pictures)
+        reading = options.DataOptions(episodes=episodes, units=["raw"])
+        recording = reading.opened(str(pictures), None, frames={})
+    shown = board_pictures(pictures, key, recording)
     result = calibrate_camera(shown, Board(columns, rows, family=family))
     entry = {**camera_content(result.camera, key), **({"link": link} if link else {})}
     entry["report"] = str(result)
     content.setdefault("cameras", {})[name] = entry
     write_cell(content, cell)
-    for problem in result.problems:
-        typer.echo(f"unlikely: {problem}")
-    typer.echo(f"{name}: {result}")
-    typer.echo(f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ...")
+    lines = [f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)]
+    next_ = f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ..."
+    typer.echo("\n".join([*lines, next_]))
 
 
 @options.command(
@@ -112,7 +105,7 @@ def cell(
     path : str
         A LeRobot data set with the cameras' pictures.
     cell : ``CELL.json``
-        Has the cameras, as 'tpgmm calibrate camera' writes them; other entries stay as they are.
+        Has the cameras, as 'tpgmm calibrate camera' writes them; other entries stay.
     hand : ``LINK=TARGET``
         Tags in a hand, repeatable: LINK=cube:10,11,12,13,14:0.03 has the numbers and the edge
         of the black squares [m], LINK=tag:3:0.04 a single one.
@@ -131,79 +124,66 @@ def cell(
     out : ``DIR``
         Where pictures with the corners that were seen and expected go.
     """
-    import numpy as np
-
     from tpgmm_vision.calibration.cell_calibration import Mount, calibrate_cell
     from tpgmm_vision.calibration.recorded import slow_postures
     from tpgmm_vision.cell import pose_content, read_cell, write_cell
-    from tpgmm_vision.detection.tags import TagDetector
+    from tpgmm_vision.detection.tags import Detections, TagDetector
     from tpgmm_vision.episodes.report import drawn
     from tpgmm_vision.targets import target_from
 
-    known, content = read_cell(cell), _content(cell)
-    for name in camera or ():
-        if name not in known.cameras:
-            raise UnknownNameError("camera", name, "the cell", known.cameras)
-    cameras = {
-        name: one for name, one in known.cameras.items() if name in (camera or known.cameras)
+    known, content, hands = read_cell(cell).cameras, _content(cell), hand or []
+    if unknown := [name for name in camera or () if name not in known]:
+        raise UnknownNameError("camera", unknown[0], "the cell", known)
+    cameras = {name: known[name] for name in camera or known}
+    entries = {one.partition("=")[0]: _target(one) for one in [*hands, *(check or ())]}
+    mounts = {
+        name: Mount(target_from(entry, name), name if k < len(hands) else None)
+        for k, (name, entry) in enumerate(entries.items())
     }
-    entries = {one.partition("=")[0]: _target(one) for one in [*(hand or ()), *(check or ())]}
-    mounts = {name: Mount(target_from(entry, name), name if k < len(hand or ()) else None)
-              for k, (name, entry) in enumerate(entries.items())}  # fmt: skip
-    if len({mount.target.family for mount in mounts.values()}) > 1:
-        raise DataError("all targets have tags of one family")
-    links = [mount.link for mount in mounts.values()] + [one.link for one in cameras.values()]
+    links = {mount.link for mount in mounts.values()} | {one.link for one in cameras.values()}
     wanted = {*(described.link or ()), *(link for link in links if link)}
     robot = replace(described, link=sorted(wanted)).read()
-    if robot is None:
-        raise DataError("a cell is calibrated by its robot: --robot FILE")
+    if robot is None or not cameras or not mounts:
+        raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
+                        "(tpgmm calibrate camera) and tags in its hand (--hand)")  # fmt: skip
+    if content.get("joints", names := list(robot.joint_names)) != names:
+        raise DataError(f"{cell} is of a robot with joints {content['joints']}, this one has "
+                        f"{names}: give another --cell")  # fmt: skip
+    families = {mount.target.family for mount in mounts.values()}
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
-    with _progress("reading") as advance:
-        recording = reading.opened(path, robot, frames={})
-        joints, pictures = slow_postures(recording, cameras, advance)
-    find = TagDetector()
-    with _progress("looking for tags") as advance:
-        seen = {}
-        for k, (name, images) in enumerate(pictures.items()):
-            seen[name] = []
-            for image in images:
+    recording = reading.opened(path, robot, frames={})
+    joints, pictures = slow_postures(recording, {n: one.key for n, one in cameras.items()})
+    find = TagDetector(families.pop())
+    shown: dict[tuple[str, int], Any] = {}
+    seen: dict[str, list[Detections]] = {name: [] for name in cameras}
+    with Progress(transient=True) as bar:
+        for k, images in bar.track(pictures, total=len(joints), description="looking"):
+            for name, image in images.items():
                 cameras[name].camera.check(image, name)
+                shown[name, k] = image
                 seen[name].append(find(image))
-                advance(k * len(images) + len(seen[name]), len(pictures) * len(images))
     result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
     for name, pose in result.cameras.items():
-        content["cameras"][name] |= {
-            "pose": pose_content(pose),
-            "report": str(result).splitlines()[0],
-        }
-    for name, mount in mounts.items():
-        if mount.link is None:
-            content.setdefault("checks", {})[name] = {
-                "target": entries[name], "pose": pose_content(result.mounts[name]),
-            }  # fmt: skip
-    content["joints"] = list(robot.joint_names)
-    content["joint_offsets"] = {
-        name: round(value, 6) for name, value in result.joint_offsets.items()
-        if name not in result.unknown
-    }  # fmt: skip
+        report = str(result).splitlines()[0]
+        content["cameras"][name] |= {"pose": pose_content(pose), "report": report}
+    for name in check or ():
+        name = name.partition("=")[0]
+        entry = {"target": entries[name], "pose": pose_content(result.mounts[name])}
+        content.setdefault("checks", {})[name] = entry
+    offsets = result.joint_offsets.items()
+    content["joints"] = names
+    content["joint_offsets"] = {n: round(v, 6) for n, v in offsets if n not in result.unknown}
     out.mkdir(parents=True, exist_ok=True)
-    for name, images in pictures.items():
-        for k, image in enumerate(images):
-            file = out / f"{name}_{k:03}.jpg"
-            file.write_bytes(
-                drawn(image, seen[name][k].corners, result.expected.get((name, k), {}))
-            )
+    for (name, k), image in shown.items():
+        jpeg = drawn(image, seen[name][k].corners, result.expected.get((name, k), {}))
+        (out / f"{name}_{k:03}.jpg").write_bytes(jpeg)
     write_cell(content, cell)
-    typer.echo(
-        f"{', '.join(result.cameras)}: {len(np.unique(joints, axis=0))} postures; {result}"
-    )
-    for prefix, moved in result.bases.items():
-        typer.echo(f"base of {prefix}: move it by {pose_content(moved)} in the base frame")
-    for problem in result.problems:
-        typer.echo(f"unlikely: {problem}")
-    typer.echo(
-        f"written to {cell}, pictures to {out}; next: tpgmm dataset track SET OUT --cell {cell}"
-    )
+    lines = [f"{', '.join(cameras)}: {len(joints)} postures; {result}"]
+    lines += [f"base of {prefix!r}: moved by {pose_content(pose)} from where --robot has it"
+              for prefix, pose in result.bases.items()]  # fmt: skip
+    lines += [f"unlikely: {problem}" for problem in result.problems]
+    next_ = f"pictures in {out}; next: tpgmm dataset track SET OUT --cell {cell}"
+    typer.echo("\n".join([*lines, f"written to {cell}, {next_}"]))
 
 
 def _target(text: str) -> dict[str, Any]:
@@ -225,16 +205,6 @@ def _content(path: Path) -> dict[str, Any]:
     """What is in a cell file; nothing if there is none."""
     from tpgmm_vision.cell import cell_from
 
-    content = json.loads(read_whole(path)) if path.exists() else {}
+    content: dict[str, Any] = json.loads(read_whole(path)) if path.exists() else {}
     cell_from(content, str(path))
     return content
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar, and what moves it."""
-    from rich.progress import Progress
-
-    with Progress(transient=True) as bar:
-        task = bar.add_task(what)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

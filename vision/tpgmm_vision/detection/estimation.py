@@ -28,14 +28,14 @@ CORNER_STD = 0.1
 STEPS, SMALL_STEP = 8, 0.01
 #: Hypotheses this far apart are two [rad].
 DISTINCT = np.radians(3)
-#: The second hypothesis must fit this many times worse than the first, whose misfit counts as
-#: at least one standard deviation for each number that is known.
-LEAST_RATIO = 4.0
-#: Corners further than this from where they should be contradict the pose, root mean square in
-#: standard deviations.
-MOST_MISFIT = 5.0
+#: So much larger must the sum of squares of the second hypothesis be, in units of what is left
+#: of the first for each number that is known, at least a variance: a likelihood ratio of e^-10.
+LEAST_EVIDENCE = 20.0
+#: Corners contradict a pose that are further than both from where they should be, root mean
+#: square: in standard deviations, and as a share of an edge, by which cubes are glued badly.
+MOST_MISFIT, CRAFT = 5.0, 0.015
 #: A pose less certain than this is not valid: standard deviation [m] and [rad].
-MOST_UNCERTAIN = 0.005, np.radians(3)
+MOST_UNCERTAIN = 0.003, np.radians(3)
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,8 @@ def estimate_pose(
             ):
                 fit = free
         fit = fit or problem.best(None)
-        misfit = fit.cost / problem.freedom
-        if misfit <= MOST_MISFIT**2 or len(problem.tags) == 1:
-            return problem.judged(fit, misfit)
+        if len(problem.tags) == 1 or not problem.contradicts(fit):
+            return problem.judged(fit)
         problem = problem.without(problem.worst(fit.pose))
     return None
 
@@ -258,7 +257,7 @@ class _Problem:
         for _ in range(STEPS):
             scale = np.diag(np.diag(information)) * damping + 1e-6 * np.eye(6)
             step = -np.linalg.solve(information + scale, gradient)
-            step *= min(1, 0.5 / float(np.abs(step).max()))
+            step *= 0.5 / max(0.5, float(np.abs(step).max()))
             turn = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
             new = rigid(turn, pose[:3, 3] + step[:3])
             found = self.system(new, known)
@@ -297,26 +296,39 @@ class _Problem:
                 rates = np.concatenate((rates, np.eye(1, 6, 2) / HEIGHT_STD))
         return float(residual @ residual), rates.T @ residual, rates.T @ rates
 
-    def judged(self, fit: _Fit, misfit: float) -> PoseEstimate:
+    def residual(self, pose: Array) -> float:
+        """Of the corners, root mean square [pixels]."""
+        errors = np.concatenate([one.errors(pose) for one in self.seen])
+        return float(np.sqrt(np.square(errors).sum(-1).mean()))
+
+    def contradicts(self, fit: _Fit) -> bool:
+        """Whether the corners are not where they should be."""
+        edges = [
+            np.linalg.norm(one.pixels[:, 1] - one.pixels[:, 0], axis=1) for one in self.seen
+        ]
+        bound = CRAFT * float(np.median(np.concatenate(edges)))
+        return fit.cost > MOST_MISFIT**2 * self.freedom and self.residual(fit.pose) > bound
+
+    def judged(self, fit: _Fit) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
+        misfit = fit.cost / self.freedom
         inverse_information = np.linalg.pinv(fit.information, hermitian=True)
         covariance = np.asarray(inverse_information * max(misfit, 1), dtype=float)
         position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
                           (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
         reason, alternative = "", None
-        if misfit > MOST_MISFIT**2:
+        if self.contradicts(fit):
             reason = "the corners of its tag fit no pose"
-        elif fit.second and fit.second.cost < LEAST_RATIO * max(fit.cost, self.freedom):
-            reason, alternative = "two poses explain what is seen", fit.second.pose
         elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
             reason = (
                 f"it is uncertain by {1e3 * position:.0f} mm and {np.degrees(turn):.0f} deg: "
                 "its tags are too small in the picture"
             )
-        errors = np.concatenate([one.errors(fit.pose) for one in self.seen])
-        residual = float(np.sqrt(np.mean(np.square(errors).sum(-1))))
+        elif fit.second and fit.second.cost - fit.cost < LEAST_EVIDENCE * max(misfit, 1):
+            reason, alternative = "two poses explain what is seen", fit.second.pose
+        left = self.residual(fit.pose)
         return PoseEstimate(
-            fit.pose, covariance, residual, not reason, reason, self.tags, alternative
+            fit.pose, covariance, left, not reason, reason, self.tags, alternative
         )
 
 

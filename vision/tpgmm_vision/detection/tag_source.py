@@ -120,17 +120,24 @@ class TagSource:
             if one.key not in images:
                 raise UnknownNameError("picture", one.key, "the observation", images)
             one.camera.check(images[one.key], name)
-            boxes = self._boxes.get(name)
-            self.detections[name] = {
-                family: detector(images[one.key], boxes)
-                for family, detector in self._detectors.items()
-            }
+            self.detections[name] = self._detected(name, images[one.key])
         self._check(places)
         found = {name: self._object(name, places, time) for name in self._targets}
         self._boxes = {
             name: self._around(name, one, places) for name, one in self._cameras.items()
         }
         return found
+
+    def _detected(self, name: str, picture: NDArray[np.uint8]) -> dict[str, Detections]:
+        """Tags in a picture: near where they were, or everywhere if that is not all."""
+        before, boxes = self.detections.get(name, {}), self._boxes.get(name)
+        found = {f: detect(picture, boxes) for f, detect in self._detectors.items()}
+        if boxes is None or all(
+            found[family].corners.keys() >= known.corners.keys()
+            for family, known in before.items()
+        ):
+            return found
+        return {f: detect(picture) for f, detect in self._detectors.items()}
 
     def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
         """What all cameras see of a target that are where they were."""

@@ -28,9 +28,10 @@ MARGIN = 0.35
 BLUR, LEAST_BLUR, MOST_BLUR = 0.5, 0.1, 6.0
 #: Steps of Gauss-Newton, and a step of all corners that ends it [pixels].
 STEPS, SMALL_STEP = 8, 0.02
-#: A fit is refused that moves a corner further than this [share of an edge], or explains less
-#: than this share of the variance of the grey values.
-FARTHEST, LEAST_EXPLAINED = 0.2, 0.7
+#: A fit is refused that moves a corner further than this [share of an edge], explains less than
+#: this share of the variance of the grey values, or leaves a corner less certain than this
+#: [pixels].
+FARTHEST, LEAST_EXPLAINED, MOST_UNCERTAIN = 0.2, 0.8, 0.3
 #: A tag of fewer pixels is not fitted: there are 17 unknowns.
 LEAST_PIXELS = 60
 #: What noise does not explain: the lens, the print, the light [pixels].
@@ -243,8 +244,10 @@ class _Fit:
             return None
         covariance = np.linalg.pinv(normal, hermitian=True)[:8, :8] * noise
         rates = self._rates(corners)
-        error = MODEL_ERROR**2 * np.eye(8)
-        return corners, rates @ covariance @ rates.T + error
+        covariance = rates @ covariance @ rates.T + MODEL_ERROR**2 * np.eye(8)
+        if float(np.diag(covariance).max()) > MOST_UNCERTAIN**2:
+            return None
+        return corners, covariance
 
     def _moved(self, corners: Array, step: Array) -> tuple[Array, float]:
         """Corners after a projective motion in coordinates of the patch, and the furthest."""

@@ -1,4 +1,4 @@
-"""Poses of one object over time: jumps are confirmed, flips are resolved, short gaps filled."""
+"""Poses of one object over time: jumps are confirmed, flips are resolved."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ SPEED, TURN = 1.5, np.radians(360)
 SPREAD, SPREAD_ANGLE = 0.005, np.radians(4)
 #: A pose further away than an object is moved counts when as many in a row agree.
 CONFIRMED = 3
-#: A gap is filled, and a flip resolved, by what was seen at most so long ago [s].
-GAP, MEMORY = 0.2, 0.5
-#: Standard deviation of the speed of what is not seen [m/s] and [rad/s].
-DRIFT = 0.02, np.radians(5)
+#: A flip is resolved by what was seen at most this long ago [s].
+MEMORY = 0.5
 
 
 @dataclass(frozen=True)
@@ -104,15 +102,11 @@ class Tracker:
         return away <= SPREAD + SPEED * passed and turned <= SPREAD_ANGLE + TURN * passed
 
     def _missing(self, time: float, reason: str) -> Track | None:
-        """The last pose, valid for a moment."""
+        """The last pose, which is not valid."""
         last = self._last
         if last is None:
             return None
-        age = time - last.seen
-        growth = np.repeat(np.square(np.multiply(DRIFT, age)), 3)
-        if age <= GAP:
-            return replace(last, covariance=last.covariance + np.diag(growth))
-        return replace(last, valid=False, reason=f"{reason}, for {age:.1f} s")
+        return replace(last, valid=False, reason=f"{reason}, for {time - last.seen:.1f} s")
 
 
 def _agree(one: PoseEstimate, other: PoseEstimate) -> bool:

@@ -71,7 +71,7 @@ def _longest_gap(track: Track) -> tuple[int, int]:
 
 def table(reports: Sequence[EpisodeReport]) -> list[tuple[str, ...]]:
     """A line for each object in each episode, below a head."""
-    lines = [HEAD]
+    lines: list[tuple[str, ...]] = [HEAD]
     for report in reports:
         for name, track in report.tracks.items():
             shares = track.seen, track.known & ~track.seen, ~track.known

@@ -28,9 +28,9 @@ LEVER = 0.05
 REST_DISTANCE, REST_NOISE = 0.003, 3.0
 #: A rest takes this long [s], and has so many frames; so many frames elsewhere end it.
 REST_TIME, REST_FRAMES, ELSEWHERE = 0.3, 5, 3
-#: Of a hand that carries an object so many frames must tell, over a way of so many times what
-#: counts as rest; an object is put down to twice that.
-CARRIED_FRAMES, CARRIED_WAY, PUT = 3, 3.0, 2.0
+#: Of a hand that carries an object so many frames must tell, over a way of so many times that
+#: by which its place in the hand may change, as for ``find_holds`` [m].
+CARRIED_FRAMES, CARRIED_WAY, SLIP = 3, 3.0, 0.01
 #: A gap in a motion that is interpolated, as long as a hand's motion is nearly straight [s].
 SHORT_GAP = 0.2
 #: By when an object must have been seen at rest: a robot hardly reaches it earlier [s].
@@ -82,6 +82,10 @@ class Track:
         index = np.flatnonzero(self.seen)
         if not len(index):
             raise DataError(f"it was never seen: {self.reasons[-1]}")
+        runs = np.split(index, np.flatnonzero(np.diff(self.time[index]) > LATE) + 1)
+        for run in runs[1:]:
+            self.seen[run] = len(run) >= CARRIED_FRAMES  # fewer, alone for long, may be wrong
+        index = np.flatnonzero(self.seen)
         points, self.known = _points(self.poses[index]), self.seen.copy()
         jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
         noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
@@ -125,7 +129,7 @@ class Track:
             off, taken, put, poses = min(
                 found, key=lambda one: one[0], default=(np.inf, a, b, ends)
             )
-            if off <= PUT * self._tolerance:
+            if off <= SLIP:
                 self._fill(gap, poses[gap])
                 self._fill(slice(a + 1, taken + 1), ends[0])
                 self._fill(slice(put, b), ends[1])
@@ -143,26 +147,36 @@ class Track:
         """Rows in which a hand may have taken or put down the object, and its poses in it."""
         if self._rest[at] >= 0:
             return gap, inverse(hand[gap]) @ self.poses[at]
-        return np.array([at]), self._held(hand, at, way)[1][None]
+        rows = self._next(at, way)[: 2 * ELSEWHERE + 1]
+        return np.array([at]), mean_pose(list(inverse(hand[rows]) @ self.poses[rows]))[0][None]
 
-    def _held(self, hand: Array, at: int, way: int) -> tuple[int, Array]:
-        """In how many rows up to (-1) or from (1) one a hand carries an object; its pose, or NaN."""
+    def _next(self, at: int, way: int) -> Any:
+        """Known rows, beginning with one, and before (-1) or after it (1)."""
         rows = np.flatnonzero(self.known)
-        rows = rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+        return rows[rows <= at][::-1] if way < 0 else rows[rows >= at]
+
+    def _held(self, hand: Array, at: int) -> tuple[int, Array]:
+        """For how many rows up to one a hand carries the object; its pose, or NaN."""
+        rows = self._next(at, -1)
         inside = inverse(hand[rows]) @ self.poses[rows]
         points = _points(inside)
-        away = np.linalg.norm(points - np.median(points[:CARRIED_FRAMES], axis=0), axis=1)
-        count = int(np.append(away > self._tolerance, True).argmax())
-        moved = np.linalg.norm(_points(self.poses[rows]) - _points(self.poses[at]), axis=1)
-        if count < CARRIED_FRAMES or moved[:count].max() < CARRIED_WAY * self._tolerance:
+        middle = np.median(points[: 2 * ELSEWHERE + 1], axis=0)
+        away = np.linalg.norm(points - middle, axis=1) > SLIP
+        lost = np.convolve(away, np.ones(ELSEWHERE), "valid") == ELSEWHERE
+        count = int(np.append(lost, True).argmax())
+        held = np.flatnonzero(~away[:count])
+        moved = np.linalg.norm(
+            _points(self.poses[rows[held]]) - _points(self.poses[at]), axis=1
+        )
+        if len(held) < CARRIED_FRAMES or moved.max() < CARRIED_WAY * SLIP:
             return 0, np.full((4, 4), np.nan)
-        return count, mean_pose(list(inside[: min(count, 4 * CARRIED_FRAMES)]))[0]
+        return count, mean_pose(list(inside[held[: 4 * CARRIED_FRAMES]]))[0]
 
     def _finish(self, last: int, hands: Mapping[str, Array]) -> None:
         """Fill what follows the last known row."""
         rows = slice(last + 1, len(self.time))
         self.poses[rows] = self.poses[last]
-        found = [(*self._held(hand, last, -1), hand) for hand in hands.values()]
+        found = [(*self._held(hand, last), hand) for hand in hands.values()]
         if self._rest[last] < 0 and found:
             count, grasp, hand = max(found, key=lambda one: one[0])
             if count:

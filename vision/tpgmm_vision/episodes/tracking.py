@@ -12,7 +12,14 @@ import torch
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, summed_up
-from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, with_frames
+from tpgmm_datasets.lerobot.columns import (
+    ACTION,
+    ENVIRONMENT,
+    KNOWN,
+    RESIDUAL,
+    SEEN,
+    with_frames,
+)
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout
@@ -30,13 +37,9 @@ from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import EpisodePictures
 from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transformed
-from tpgmm_vision.sources import ObservedPose, pose_source
+from tpgmm_vision.sources import pose_source
 
 __all__ = ["track_lerobot"]
-
-#: Columns of a tracked set; their names do not begin with "observation.", so that no policy
-#: takes them for something that it is given.
-SEEN, KNOWN, RESIDUAL = "tracking.seen", "tracking.known", "tracking.residual"
 
 
 def track_lerobot(
@@ -103,7 +106,8 @@ def track_lerobot(
             f"objects cannot be followed in episodes {episodes}: "
             f"{'; '.join(summed_up(problems))}. Nothing was written. Record them again, or "
             f"leave them out: lerobot-edit-dataset --repo_id {folder.name} --root {folder} "
-            f"--new_root NEW --operation.type delete_episodes --operation.episode_indices '{episodes}'"
+            "--new_root NEW --operation.type delete_episodes "
+            f"--operation.episode_indices '{episodes}'"
         )
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
@@ -133,13 +137,6 @@ def _offsets(
         matched = match_names(list(given), names, key)
         declared[key] = [given.get(matched.get(name, ""), 0.0) for name in names]
     return declared
-
-
-def _repeated(now: ObservedPose, last: ObservedPose | None) -> bool:
-    """Whether a source repeats for a moment what it measured before, less certain now."""
-    if last is None or not np.array_equal(now.pose, last.pose):
-        return False
-    return bool(np.trace(now.covariance) > np.trace(last.covariance))
 
 
 class _Tracker:
@@ -188,20 +185,17 @@ class _Tracker:
         self, rows: EpisodeRows, joints: Sequence[Mapping[str, float]], report: EpisodeReport
     ) -> list[dict[str, dict[int, Array]]]:
         """Put what the source measures into tracks; corners that it saw, by row and camera."""
-        last, corners = dict[str, ObservedPose](), list[dict[str, dict[int, Array]]]()
+        corners = list[dict[str, dict[int, Array]]]()
         self.source.reset()
         for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
             now, source = float(rows.time[row]), self.source
             for name, one in source.poses(images, joints[row], now).items():
                 track = report.tracks.setdefault(name, Track(rows.time))
                 track.reasons[row] = one.reason
-                if one.valid and not _repeated(one, last.get(name)):
-                    last[name], track.poses[row] = one, pose_matrix(one.pose)
+                if one.valid:
                     estimate = getattr(source, "estimates", {}).get(name)
-                    track.seen[row], track.residuals[row] = (
-                        True,
-                        getattr(estimate, "residual", 0),
-                    )
+                    track.poses[row], track.seen[row] = pose_matrix(one.pose), True
+                    track.residuals[row] = getattr(estimate, "residual", 0)
             if source.problem:
                 raise DatasetError(f"at {now:.2f} s {source.problem}", episode=report.index)
             corners.append({

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,12 @@ import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pyarrow.dataset import dataset, field
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.files import chunked_files
 from tpgmm_datasets.lerobot.layout import Episode, Layout, episode_file
-from tpgmm_datasets.lerobot.parquet import open_parquet, read_columns
+from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_vision.poses import Array
 
 __all__ = ["EpisodePictures", "Picture"]
@@ -120,14 +120,13 @@ class EpisodePictures:
     def _images(self, key: str, episode: Episode, rows: int) -> Iterator[Picture]:
         root, count = self.layout.root, 0
         where: dict[str, Any] = {"file": episode.file, "episode": episode.index, "column": key}
-        columns = ["episode_index", key]
-        with open_parquet(root / episode.file, root, columns) as parquet:
-            inside = _row_groups(parquet, episode, self.layout)
-            for batch in parquet.iter_batches(IMAGE_ROWS, inside, columns=columns):
-                for index, stored in zip(*(batch[c].to_pylist() for c in columns), strict=True):
-                    if index == episode.index:
-                        yield _decoded(stored, root, {**where})
-                        count += 1
+        batches = dataset(root / episode.file).to_batches(
+            columns=[key], filter=field("episode_index") == episode.index,
+            batch_size=IMAGE_ROWS, batch_readahead=1,
+        )  # fmt: skip
+        for stored in (one for batch in batches for one in batch[key].to_pylist()):
+            yield _decoded(stored, root, where)
+            count += 1
         if count != rows:
             raise _unlike(f"there are {count} images for {rows} rows", where)
 
@@ -156,18 +155,6 @@ def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[f
         )
         message = f"the video is {problem} ({error})"
         raise DatasetError(message, check="missing", **where) from error
-
-
-def _row_groups(parquet: Any, episode: Episode, layout: Layout) -> list[int]:
-    """The row groups of a data file that may hold rows of an episode."""
-    groups = range(parquet.metadata.num_row_groups)
-    if episode.start is None:
-        return list(groups)
-    same = [one.start or 0 for one in layout.episodes if one.file == episode.file]
-    first = episode.start - min(same)
-    ends = np.cumsum([0, *(parquet.metadata.row_group(g).num_rows for g in groups)])
-    last = first + episode.length
-    return [g for g, (a, b) in enumerate(pairwise(ends)) if a < last and b > first]
 
 
 def _decoded(stored: Any, root: Path, where: dict[str, Any]) -> Picture:

@@ -1,0 +1,110 @@
+"""``tpgmm calibrate`` as a user types it: from pictures and a recorded set to a cell file."""
+
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.support.rendered_boards import BoardCamera
+from tests.support.simulated_cells import CAMERA, HAND, record, so101_cell
+from tpgmm_vision.cell import camera_content, read_cell, write_cell
+from tpgmm_vision.commands.calibrate import app
+from tpgmm_vision.poses import angle_between
+from tpgmm_vision.targets import Board
+
+KEY = "observation.images.front"
+CUBE = "cube:10,11,12,13,14:0.03"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(one) for one in arguments])
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    rng = np.random.default_rng(5)
+    cell = so101_cell(1.0, rng, pixels=0.0)
+    root = tmp_path_factory.mktemp("waving") / "set"
+    return cell, record(root, cell, cell.postures(16, rng), rng)
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "cell.json"
+    cup = {"target": {"tag": 3, "size": 0.04}, "upright": True}
+    front = camera_content(CAMERA, KEY)
+    write_cell({"cameras": {"front": front}, "objects": {"cup": cup}}, path)
+    return path
+
+
+def test_a_cell_is_calibrated_by_a_recorded_set(recorded, written, tmp_path):
+    cell, path = recorded
+    out = tmp_path / "pictures"
+    arguments = ["--robot", "so101", "--units", "deg", "--hand", f"{HAND}={CUBE}"]
+    done = run("cell", path, "--cell", written, *arguments, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert re.search(r"1[56] postures; error between object and hand", done.output)
+    found = read_cell(written)
+    pose, true = found.cameras["front"].pose, cell.cameras["front"][0]
+    assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.02
+    assert angle_between(pose, true) < np.radians(3)
+    assert found.joints == cell.robot.joint_names
+    assert "shoulder_lift" in found.joint_offsets
+    assert found.objects["cup"].upright  # what was written by hand stays
+    pictures = [cv2.imread(str(one)) for one in sorted(out.iterdir())]
+    assert len(pictures) in (15, 16)
+    orange, green = (
+        sum(((one.astype(int) * sign).sum(-1) > 100).sum() for one in pictures)
+        for sign in ((-1, 0, 1), (-1, 2, -1))
+    )
+    assert orange > 100 and green > 100
+
+
+def test_what_the_options_get_wrong_is_said_and_nothing_is_written(recorded, written, tmp_path):
+    _, path = recorded
+    before = written.read_text()
+    arguments = [
+        "cell",
+        path,
+        "--cell",
+        written,
+        "--out",
+        tmp_path / "none",
+        "--robot",
+        "so101",
+    ]
+    for options, said in (
+        (["--hand", f"{HAND}=cube"], "tags are described as"),
+        (["--units", "deg"], "tags in its hand (--hand)"),
+        (["--units", "deg", "--hand", f"hand={CUBE}"], "'hand'"),
+        (["--units", "deg", "--hand", f"{HAND}={CUBE}", "--camera", "side"], "'side'"),
+        (["--units", "deg", "--hand", f"{HAND}=tag:7:0.04"], "sees tags of"),
+    ):
+        done = run(*arguments, *options)
+        assert done.exit_code != 0
+        assert said in str(done.exception), done.exception
+    other = json.loads(before) | {"joints": ["a", "b"]}
+    write_cell(other, written)
+    done = run(*arguments, "--units", "deg", "--hand", f"{HAND}={CUBE}")
+    assert "is of a robot with joints ['a', 'b']" in str(done.exception)
+    assert json.loads(written.read_text()) == other
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_camera_is_calibrated_by_a_folder_of_pictures(written, tmp_path):
+    folder, rng = tmp_path / "board", np.random.default_rng(1)
+    folder.mkdir()
+    for name, picture in BoardCamera(CAMERA, Board()).pictures(10, rng).items():
+        cv2.imwrite(str(folder / name), picture)
+    done = run("camera", folder, "--name", "wrist", "--link", HAND, "--cell", written)
+    assert done.exit_code == 0, done.output
+    assert "wrist: focal length 55" in done.output
+    found = read_cell(written)
+    assert found.cameras["wrist"].key == "observation.images.wrist"
+    assert found.cameras["wrist"].link == HAND
+    assert list(found.objects) == ["cup"]
+    done = run("camera", tmp_path / "none.mp4", "--name", "wrist", "--cell", written)
+    assert "no folder, video or data set" in str(done.exception)
