@@ -68,12 +68,13 @@ class Reach:
             If there is none.
         """
         model, data = self._model, self._data
+        goal, tool, upwards = (np.array(one, dtype=float) for one in (target, point, up))
         found, moved, turned = np.array(joints, dtype=float), *np.zeros((2, 3, model.nv))
         for _ in range(STEPS):
             position, axes = self.pose(found)
             mujoco.mj_comPos(model, data)
-            place, axis = position + axes @ point, axes @ up
-            error = np.concatenate((np.subtract(target, place), -axis[:2]))
+            place, axis = position + axes @ tool, axes @ upwards
+            error = np.concatenate((goal - place, -axis[:2]))
             if np.abs(error).max() < CLOSE:
                 return found
             mujoco.mj_jac(model, data, moved, turned, place, self._hand)
@@ -84,6 +85,6 @@ class Reach:
             found = found + step * min(1.0, STRIDE / max(np.abs(step).max(), 1e-9))
             found = np.clip(found, self._low, self._high)
         raise DataError(
-            f"the arm does not reach {np.round(target, 3).tolist()}: it misses by "
+            f"the arm does not reach {goal.round(3).tolist()}: it misses by "
             f"{1e3 * np.linalg.norm(error[:3]):.1f} mm and {np.linalg.norm(error[3:]):.3f} rad"
         )

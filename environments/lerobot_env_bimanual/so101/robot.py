@@ -18,8 +18,8 @@ BACKLASH = math.radians(0.4)
 #: What the joint behind a motor is called.
 PLAY = "_play"
 #: A servo STS3215: stiffness [N m / rad], so soft that gravity bends each of the joints that
-#: carry the stretched arm by up to 2 degrees; damping [N m s / rad], friction and largest torque
-#: [N m], and the inertia of its rotor behind the gears [kg m^2].
+#: carry the stretched arm by up to 2 degrees; damping [N m s / rad], friction and largest
+#: torque [N m], and the inertia of its rotor behind the gears [kg m^2].
 STIFFNESS, DAMPING, FRICTION, TORQUE, ROTOR = 17.8, 0.6, 0.05, 3.0, 0.028
 #: Largest torque of the gripper, that of LeRobot's settings (half of the others') [N m].
 GRIP_TORQUE = 1.0
