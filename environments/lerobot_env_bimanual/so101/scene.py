@@ -25,7 +25,7 @@ from lerobot_env_bimanual.so101.robot import PLAY, hand_of, so101_spec
 from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 
 __all__ = [
-    "CARRIERS", "CUP", "GRIP", "LEFT", "LEFT_UP", "OBJECTS", "RIGHT", "RIGHT_UP", "SAUCER_TOP",
+    "CARRIERS", "CUP", "GRIP", "LEFT_UP", "OBJECTS", "RIGHT_UP", "SAUCER_TOP",
     "STEM", "BiSo101Scene", "in_left_hand",
 ]  # fmt: skip
 
