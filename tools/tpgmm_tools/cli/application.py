@@ -15,7 +15,7 @@ from tpgmm_tools.cli import dataset, demo, plot, plugins, reproduce, view
 __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
-ORDER = ("demo", "fit", "reproduce", "plot", "view", "app", "dataset")
+ORDER = ("demo", "fit", "reproduce", "plot", "view", "app", "dataset", "camera", "calibrate")
 #: Those that are imported when they run, and their line in ``--help``.
 LATE = {
     "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
@@ -24,6 +24,8 @@ LATE = {
 HELP = {
     "fit": "Learn a skill from a LeRobot data set.",
     "app": "Learn and look in the browser: a data set in, a moving picture out.",
+    "camera": "Print tags and boards that cameras find.",
+    "calibrate": "Find lenses and places of cameras, and joint offsets, by the robot's motion.",
 }
 #: Extras by the packages that come with them.
 OPTIONAL = dict.fromkeys(("matplotlib", "pandas", "pyarrow"), "cli")
