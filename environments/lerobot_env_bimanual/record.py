@@ -217,7 +217,7 @@ def record(
     if hand not in HANDS:
         raise UnknownNameError("hand", hand, "the recorder", HANDS)
     if shows and robot == BI_SO101:
-        chosen = {"cameras": cameras, "fps": fps, "size": size, "codec": codec}
+        chosen: dict[str, Any] = {"cameras": cameras, "fps": fps, "size": size, "codec": codec}
         return record_waving(out, n=n, seed=seed, **chosen)
     able = expert("lid" if shows else task, robot)
     env = able.environment(fps=fps, noise=noise)
