@@ -14,7 +14,7 @@ from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
-from tpgmm_datasets.units import Scale, shifted
+from tpgmm_datasets.units import Scale, as_scale, shifted
 
 __all__ = ["CELL", "Signals"]
 
@@ -37,7 +37,7 @@ class Signals:
         them.
     units : mapping of str to (float, float)
         Factor and offset that bring a stored value to radians or metres, by joint; those
-        that are left out are so stored.
+        that are left out are so stored. Without the joints' offsets, if there is a cell.
     frames : mapping of str to tuple of int
         Where frames are in ``observation.environment_state``, as position and quaternion
         (w, x, y, z) in metres.
@@ -101,6 +101,10 @@ class Signals:
             and environment
             and (pose.feature, pose.rotation, pose.scale) == (ENVIRONMENT, "wxyz", 1)
         }
+        cell = layout.root / CELL
+        if cell.exists():  # which has the offsets, and a policy adds them
+            bare = dict(zip(columns.names or (), columns.units, strict=False))
+            scales = {name: as_scale(bare[name], source.key) for name in scales}
         return cls(
             assembly.rate or layout.fps,
             state.names,
@@ -108,7 +112,7 @@ class Signals:
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
             places,
-            cell if (cell := layout.root / CELL).exists() else None,
+            cell if cell.exists() else None,
         )
 
 

@@ -31,9 +31,10 @@ from lerobot_env_bimanual.eyes.recorder import CODECS, recording, row
 from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
-from lerobot_env_bimanual.so101 import TASKS
+from lerobot_env_bimanual.so101 import BI_SO101, TASKS
 from lerobot_env_bimanual.so101.env import BiSo101Env
 from lerobot_env_bimanual.so101.expert import teleoperated
+from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
@@ -115,7 +116,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
         able = suite_task(task, robot)
         made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
         return Expert(made, lambda seed: of(1, seed)[0], able.objects)
-    if robot != UPPER_BODY:
+    if robot not in (UPPER_BODY, BI_SO101 if task in TASKS else UPPER_BODY):
         raise DataError(f"{task} is done by its own robot alone, not by {robot!r}")
     return ALONE[task]
 
@@ -181,7 +182,8 @@ def record(
     size : (int, int)
         Width and height of the pictures.
     robot : str, default="upper_body"
-        Who does a task of the suite, or is calibrated.
+        Who does a task of the suite, or is calibrated; ``"bi_so101"`` with both hands at once,
+        and its own offsets.
     codec : {"av1", "h264", "pictures"}, default="av1"
     imperfections : Imperfections, optional
         What spoils the pictures.
@@ -214,6 +216,9 @@ def record(
     shows, rng = task == CALIBRATION, np.random.default_rng(seed)
     if hand not in HANDS:
         raise UnknownNameError("hand", hand, "the recorder", HANDS)
+    if shows and robot == BI_SO101:
+        chosen: dict[str, Any] = {"cameras": cameras, "fps": fps, "size": size, "codec": codec}
+        return record_waving(out, n=n, seed=seed, **chosen)
     able = expert("lid" if shows else task, robot)
     env = able.environment(fps=fps, noise=noise)
     names, offsets, options = env.joint_names, np.zeros(len(env.joint_names)), dict[str, Any]()
@@ -307,7 +312,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--cameras", default="front", help="names, with commas between them")
     add("--fps", type=int, default=25, help="rows per second")
     add("--size", type=int, nargs=2, default=(640, 480), help="width and height of pictures")
-    add("--robot", choices=ROBOTS, default=UPPER_BODY, help="who does it")
+    add("--robot", choices=(*ROBOTS, BI_SO101), default=UPPER_BODY, help="who does it")
     add("--codec", choices=CODECS, default="av1", help="of the videos")
     add("--noise", type=float, default=0.0, help="of the sensors, in demonstrations")
     add("--true-poses", action="store_true", help="demonstrations with the poses of objects")

@@ -1,5 +1,7 @@
 """What a data set calls its signals: names, units, rate, and where frames are."""
 
+import shutil
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -8,7 +10,7 @@ from tests.support.lerobot_sets import change_info
 from tpgmm_datasets import FramePose, LinkPose, save_lerobot
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
-from tpgmm_datasets.signals import Signals
+from tpgmm_datasets.signals import CELL, Signals
 from tpgmm_torch import Demonstration, Frame
 
 
@@ -34,6 +36,21 @@ def test_signals_of_a_data_set(stored):
     assert told.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
     assert told.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
     assert told.environment_names[7] == "cup.x"
+
+
+def test_offsets_that_a_cell_adds_are_no_part_of_the_units(stored, tmp_path):
+    tracked = tmp_path / "set"
+    shutil.copytree(stored, tracked)
+
+    def shift(info):
+        for name in ("observation.state", "action"):
+            info["features"][name]["info"]["offsets"] = [0.02, 0.0]
+
+    change_info(tracked, shift)
+    choices = {"units": {"a.pos": "deg", "b": "mm"}, "relax": ["metadata"]}
+    assert Signals.of(tracked, Arm(), **choices).units["a"] == (np.pi / 180, 0.02)
+    (tracked / CELL).write_text("{}")
+    assert Signals.of(tracked, Arm(), **choices).units["a"] == (np.pi / 180, 0.0)
 
 
 def test_entries_are_called_as_the_joints_are(stored):

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
+#: What the arms are called.
+BI_SO101 = "bi_so101"
 #: The tasks, and what is observed in each, in that order; known without MuJoCo.
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType({"cup_on_saucer": ("cup", "saucer")})
 #: How many joints both arms have, with their grippers.
