@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.cell import Cell
+from tpgmm_vision.cell import Cell, check_robot
 from tpgmm_vision.poses import Array, mean_pose, pose_matrix, pose_vector
 from tpgmm_vision.sources import ObservedPose, pose_source
 
@@ -59,15 +58,7 @@ class Watch:
                 f"the cell has the objects {list(cell.objects)}, not {missing}: add them to "
                 "its file, or take poses that are observed otherwise (--policy.cell=none)"
             )
-        ours, theirs = (
-            {name for name in joints if not is_gripper(name)}
-            for joints in (robot.joint_names, cell.joints)
-        )
-        if not (ours <= theirs or theirs <= ours):
-            raise DataError(
-                f"the cell is that of a robot with the joints {list(cell.joints)}, this one "
-                f"has {list(robot.joint_names)}: it needs another cell, tpgmm calibrate cell"
-            )
+        check_robot(cell, robot)
         cell.placed()
         self.cell, self.names = cell, tuple(names)
         self._robot, self.sources = robot, [pose_source(cell, robot)]
