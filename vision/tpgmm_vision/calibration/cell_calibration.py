@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from tpgmm_vision.calibration.reprojection import Corners, Integers, Reprojectio
 from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.estimation import View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
-from tpgmm_vision.poses import Array, angle_between, inverse, mean_pose, rigid
+from tpgmm_vision.poses import Array, inverse, mean_pose, rigid
 from tpgmm_vision.targets import Target
 
 __all__ = ["CellCalibration", "Mount", "calibrate_cell"]
@@ -305,21 +306,19 @@ class _Task:
         problem, names = fit.problem, [*self.cameras, *self.mounts]
         q, _ = np.linalg.qr(fit.jacobian)
         postures = np.repeat(problem.corners.posture, 2)
-        column, found = np.cumsum(problem.free) - 1, []
-        for part in range(len(problem.carriers)):
-            own, gains = fit.jacobian[: len(postures), column[6 * part :][:6]], {}
-            for at in np.unique(postures)[2:-1]:
-                late = np.zeros((len(fit.left), 6))
-                late[: len(postures)] = own * (postures >= at)[:, None]
-                late -= q @ (q.T @ late)
-                step = np.linalg.lstsq(late, fit.left, rcond=1e-9)[0]
-                gains[int(at)] = float(fit.left @ late @ step)
-            at = max(gains, key=lambda at: gains[at])
-            moved, new = _divided(fit, part, at)
-            before, after = moved.problem.split(moved.state)[0][[part + (new < part), new]]
-            found.append((fit.surprise - moved.surprise, part, at, inverse(before) @ after))
-        gain, part, at, step = max(found, key=lambda one: one[0])
-        moved_by, turned = np.linalg.norm(step[:3, 3]), angle_between(np.eye(4), step)
+        column, best = np.cumsum(problem.free) - 1, (0.0, 0, 0, np.zeros(6))
+        for part, at in product(range(len(problem.carriers)), np.unique(postures)[2:-1]):
+            late = np.zeros((len(fit.left), 6))
+            late[: len(postures)] = fit.jacobian[: len(postures), column[6 * part :][:6]]
+            late[: len(postures)] *= (postures >= at)[:, None]
+            late -= q @ (q.T @ late)
+            step = np.linalg.lstsq(late, fit.left, rcond=1e-9)[0]
+            best = max(best, (float(fit.left @ late @ step), part, int(at), step),
+                       key=lambda one: one[0])  # fmt: skip
+        share, part, at, step = best
+        # with the noise that is left then
+        gain = -len(postures) / 2 * np.log1p(-share / (fit.left @ fit.left))
+        moved_by, turned = np.linalg.norm(step.reshape(2, 3), axis=1)
         if gain > STEP_EVIDENCE and (moved_by > LEAST_STEP[0] or turned > LEAST_STEP[1]):
             raise DataError(
                 f"{'camera' if part < len(self.cameras) else 'target'} {names[part]!r} was "
@@ -423,27 +422,6 @@ class _Task:
             Rotation.from_matrix(np.array(away)[:, :3, :3]).magnitude(),
             fit.noise.joints, problems, expected,
         )  # fmt: skip
-
-
-def _divided(fit: Adjustment, part: int, at: int) -> tuple[Adjustment, int]:
-    """A fit with one part as two, before and after a posture; and which part is the later."""
-    problem, n = fit.problem, len(fit.problem.cameras)
-    kind, number, new = (
-        ("camera", part, n) if part < n else ("target", part - n, len(problem.carriers))
-    )
-    corners, cameras, carriers = problem.corners, list(problem.cameras), list(problem.carriers)
-    poses, offsets, _ = problem.split(fit.state)
-    late = (corners.posture >= at) & (getattr(corners, kind) == number)
-    index = np.where(late, new if part < n else new - n, getattr(corners, kind))
-    cameras += cameras[part:][:1] if part < n else []
-    carriers.insert(new, carriers[part])
-    other = replace(
-        problem, corners=replace(corners, **{kind: index}), cameras=cameras, carriers=carriers,
-        free=np.zeros(0, dtype=bool),
-    )  # fmt: skip
-    state = other.state(np.insert(poses, new, poses[part], axis=0))
-    other.split(state)[1][:] = offsets
-    return adjust(other, state), new
 
 
 def _check(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.reader import Recording
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import grey
-from tpgmm_vision.episodes.video import EpisodePictures, Picture
+from tpgmm_vision.episodes.video import EpisodePictures, Picture, frames
 from tpgmm_vision.poses import Array
 
 __all__ = ["board_pictures", "slow_postures", "spread"]
@@ -54,23 +53,21 @@ def board_pictures(
         reader = EpisodePictures(recording.assembly.layout, [key])
         step = max(sum(len(one.time) for one in rows) // FRAMES, 1)
         for one in rows:
-            for k, images in enumerate(reader.read(one.episode, one.time)):
-                if k % step == 0:
-                    found[f"episode {one.episode.index}, row {k}"] = grey(images[key])
+            wanted = range(0, len(one.time), step)
+            for row, shown in reader.some(one.episode, one.time, wanted):
+                found[f"episode {one.episode.index}, row {row}"] = grey(shown[key])
     elif source.is_dir():
         read = ((file.name, cv2.imread(str(file), 0)) for file in sorted(source.iterdir()))
         found = {name: picture for name, picture in read if picture is not None}
-    else:
-        try:
-            with av.open(str(source)) as container:
-                step = max(container.streams.video[0].frames // FRAMES, 1)
-                for number, frame in enumerate(container.decode(video=0)):
-                    if number % step == 0:
-                        found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
-        except (av.error.FFmpegError, IndexError) as error:
-            raise DataError(f"{source} is no folder, video or data set ({error})") from error
+    elif source.is_file():
+        step = 1
+        for number, (_, frame) in enumerate(frames(source, 0.0, {})):
+            if number % step == 0:
+                found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
+            if len(found) == 2 * FRAMES:
+                found, step = dict([*found.items()][::2]), 2 * step
     if not found:
-        raise DataError(f"there are no pictures in {source}")
+        raise DataError(f"{source} is no folder, video or data set with pictures")
     return found
 
 
@@ -116,13 +113,10 @@ def slow_postures(
     def pictures() -> Iterator[tuple[int, dict[str, Picture]]]:
         first = 0
         for one in rows:
-            wanted = {k - first for k in chosen if first <= k < first + len(one.time)}
-            images = reader.read(one.episode, one.time) if wanted else iter(())
-            for k in range(max(wanted, default=-1) + 1):
-                shown = next(images)
-                if k in wanted:
-                    number = chosen.index(first + k)
-                    yield number, {name: shown[key] for name, key in keys.items()}
+            wanted = [k - first for k in chosen if 0 <= k - first < len(one.time)]
+            for row, shown in reader.some(one.episode, one.time, wanted):
+                number = chosen.index(first + row)
+                yield number, {name: shown[key] for name, key in keys.items()}
             first += len(one.time)
 
     return joints[chosen], pictures()

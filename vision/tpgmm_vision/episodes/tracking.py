@@ -12,14 +12,7 @@ import torch
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, summed_up
-from tpgmm_datasets.lerobot.columns import (
-    ACTION,
-    ENVIRONMENT,
-    KNOWN,
-    RESIDUAL,
-    SEEN,
-    with_frames,
-)
+from tpgmm_datasets.lerobot import columns as kept
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout
@@ -88,9 +81,9 @@ def track_lerobot(
     """
     folder, content, known = local_folder(path), read_whole(cell).decode(), read_cell(cell)
     layout = open_to_copy(folder, Path(out))
-    if SEEN in layout.features:
+    if kept.SEEN in layout.features:
         raise DatasetError(f"{path} was tracked: track the set that it was made from")
-    with_frames(layout.features.get(ENVIRONMENT), list(known.objects))
+    kept.with_frames(layout.features.get(kept.ENVIRONMENT), list(known.objects))
     tracker = _Tracker(layout, known, robot, progress)
     assembly = open_recording(folder, robot=robot, frames={}, **reading).assembly
     offsets = _offsets(layout, known, robot, reading.get("joint_names"))
@@ -112,16 +105,16 @@ def track_lerobot(
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
     frames: dict[str, dict[int, Frame]] = {name: {} for name in names}
-    columns = {key: Column(names, {}) for key in (SEEN, KNOWN, RESIDUAL)}
+    columns = {key: Column(names, {}) for key in (kept.SEEN, kept.KNOWN, kept.RESIDUAL)}
     for one in reports:
         tracks = [one.tracks[name] for name in names]
         for name, track in zip(names, tracks, strict=True):
             values = pose_vector(track.poses)
             frames[name][one.index] = Frame(values[:, :3], values[:, 3:])
-        columns[SEEN].values[one.index] = np.stack([track.seen for track in tracks], 1)
-        columns[KNOWN].values[one.index] = np.stack([track.known for track in tracks], 1)
+        columns[kept.SEEN].values[one.index] = np.stack([track.seen for track in tracks], 1)
+        columns[kept.KNOWN].values[one.index] = np.stack([track.known for track in tracks], 1)
         residuals = np.stack([track.residuals for track in tracks], 1)
-        columns[RESIDUAL].values[one.index] = residuals.astype(np.float32)
+        columns[kept.RESIDUAL].values[one.index] = residuals.astype(np.float32)
     add_frames(folder, out, frames, columns=columns, offsets=offsets, files=files)
     return reports
 
@@ -131,7 +124,7 @@ def _offsets(
 ) -> dict[str, list[float]]:
     """The joint offsets of a cell for each value of states and actions."""
     declared, given = dict[str, list[float]](), cell.joint_offsets
-    keys = {joint_feature(layout), ACTION} & layout.features.keys()
+    keys = {joint_feature(layout), kept.ACTION} & layout.features.keys()
     for key in keys if any(given.values()) else ():
         names = names_of(layout.feature(key), joint_names, robot) or ()
         matched = match_names(list(given), names, key)
@@ -169,16 +162,13 @@ class _Tracker:
                 message = f"object {name!r}: {error}"
                 raise DatasetError(message, episode=report.index) from error
         wanted = report.rows_to_show()
-        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
-            if row > max(wanted):
-                break
+        for row, images in self.pictures.some(rows.episode, rows.time, wanted):
             for name, place in camera_poses(self.cell, self.robot, named[row]).items():
-                if row in wanted:
-                    expected = self._expected(report, row, name, place)
-                    picture = images[self.cell.cameras[name].key]
-                    said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
-                    seen = detected[row].get(name, {})
-                    report.pictures.append((said, drawn(picture, seen, expected)))
+                expected = self._expected(report, row, name, place)
+                picture = images[self.cell.cameras[name].key]
+                said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
+                seen = detected[row].get(name, {})
+                report.pictures.append((said, drawn(picture, seen, expected)))
         return report
 
     def _measure(
