@@ -30,7 +30,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -302,7 +302,8 @@ def _check_unique(cell: Cell, where: str) -> None:
         if cell.source == "tags" and not thing.target.corners:
             raise DataError(f"{where}: objects: {name} needs 'target', the tags on it")
     owners: dict[tuple[str, int], str] = {}
-    for name, one in chain(cell.objects.items(), cell.checks.items()):
+    targets: Iterable[tuple[str, Any]] = chain(cell.objects.items(), cell.checks.items())
+    for name, one in targets:
         for number in one.target.corners:
             other = owners.setdefault((one.target.family, number), name)
             if other != name:

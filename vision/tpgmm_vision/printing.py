@@ -19,7 +19,7 @@ from matplotlib.path import Path as Outline
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array
-from tpgmm_vision.targets import DEFAULT_FAMILY, FAMILIES, Board, modules_of, target_from
+from tpgmm_vision.targets import DEFAULT_FAMILY, Board, dictionary_of, modules_of, target_from
 
 __all__ = ["PAGES", "print_targets"]
 
@@ -239,8 +239,8 @@ def _fill(axes: Any, squares: Array, size: float) -> None:
 
 def _tag(axes: Any, family: str, number: int, corner: Array, size: float) -> None:
     """A tag's black modules; ``corner`` is the lower left one of its black square."""
-    count, dictionary = modules_of(family), cv2.aruco.getPredefinedDictionary(FAMILIES[family])
-    picture = cv2.aruco.generateImageMarker(dictionary, number, count)
+    count = modules_of(family)
+    picture = cv2.aruco.generateImageMarker(dictionary_of(family), number, count)
     _fill(axes, corner + np.argwhere(picture[::-1] == 0)[:, ::-1] * size / count, size / count)
 
 

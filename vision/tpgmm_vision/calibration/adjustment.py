@@ -6,12 +6,11 @@ The noise of the joints is integrated out to first order: corners of one posture
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, starmap
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -55,9 +54,9 @@ class Adjustment:
     misfit : ndarray of shape (N / 4,)
         Of each tag in each picture: mean square of its corners' deviations, in units of what
         noise explains.
-    left, jacobian : ndarray of shape (n,) and (n, n_free)
+    left, jacobian : ndarray of shape (n,) and (n, n_steps)
         Errors in units of their noise, 2 N of corners and those of offsets and scales from
-        what is known before, and how the free entries of a step lessen them.
+        what is known before, and how steps lessen them.
     surprise : float
         Minus the logarithm of the likelihood, and of what is known before.
     """
@@ -73,12 +72,37 @@ class Adjustment:
     def covariance(self) -> Array:
         """Of the entries of a step (n_steps, n_steps), zero where they are not free."""
         free, found = self.problem.free, np.zeros((self.problem.n_steps,) * 2)
-        known = np.tile(1 / np.repeat(POSE_PRIOR, 3) ** 2, self.problem.n_poses)
-        weak = np.concatenate((known, np.zeros(len(free) - len(known))))[free]
-        found[np.ix_(free, free)] = np.linalg.inv(
-            self.jacobian.T @ self.jacobian + np.diag(weak)
+        weak = np.zeros(len(free))
+        weak[: self.problem.offsets.start] = np.tile(
+            np.repeat(POSE_PRIOR, 3) ** -2.0, self.problem.n_poses
         )
+        jacobian = self.jacobian[:, free]
+        normal = jacobian.T @ jacobian + np.diag(weak[free])
+        found[np.ix_(free, free)] = np.linalg.inv(normal)
         return found
+
+    def gain(self, columns: Array) -> tuple[float, Array, Array]:
+        """What another cause would explain, to first order and with the noise left by it.
+
+        Parameters
+        ----------
+        columns : ndarray of shape (n, k)
+            How steps of the cause lessen the errors.
+
+        Returns
+        -------
+        gain : float
+            By how much the logarithm of the likelihood rises.
+        step, spread : ndarray of shape (k,)
+            The likeliest step, and its standard deviations.
+        """
+        known, _ = np.linalg.qr(self.jacobian[:, self.problem.free])
+        columns = columns - known @ (known.T @ columns)
+        covariance = np.linalg.pinv(columns.T @ columns, hermitian=True)
+        share = columns.T @ self.left
+        explained = share @ covariance @ share / (self.left @ self.left)
+        gain = -len(self.left) / 2 * float(np.log1p(-explained))
+        return gain, covariance @ share, np.diag(covariance) ** 0.5
 
 
 def adjust(
@@ -103,7 +127,8 @@ def adjust(
 
         def residual(points: Tensor) -> tuple[Tensor, Tensor]:
             left, jacobian = _whitened(problem, points[0].numpy(), whitening)  # noqa: B023
-            return torch.as_tensor(left)[None], torch.as_tensor(jacobian)[None]
+            free = jacobian[:, problem.free]
+            return torch.as_tensor(left)[None], torch.as_tensor(free)[None]
 
         def retract(points: Tensor, step: Tensor) -> Tensor:
             whole = np.zeros(problem.n_steps)
@@ -136,11 +161,9 @@ def _whitening(
     _, jacobian = _errors(problem, state)
     moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
     variance, made = noise.pixels**2 / np.repeat(weights, 2), []
-    for start, stop in pairwise(2 * _starts(problem)):
-        own = slice(start, stop)
+    for own in starmap(slice, pairwise(2 * _starts(problem))):
         covariance = np.diag(variance[own]) + moved[own] @ moved[own].T
-        root = np.linalg.cholesky(covariance)
-        made.append((own, solve_triangular(root, np.eye(len(root)), lower=True)))
+        made.append((own, np.linalg.inv(np.linalg.cholesky(covariance))))
     return made
 
 
@@ -154,7 +177,7 @@ def _starts(problem: Reprojection) -> NDArray[np.int_]:
 def _whitened(
     problem: Reprojection, state: Array, whitening: list[tuple[slice, Array]]
 ) -> tuple[Array, Array]:
-    """Errors in units of their noise, and how free entries of a step lessen them."""
+    """Errors in units of their noise, and how steps lessen them."""
     errors, jacobian = _errors(problem, state)
     table = np.column_stack((errors.ravel(), jacobian.reshape(errors.size, -1)))
     table = np.concatenate([root @ table[own] for own, root in whitening])
@@ -162,14 +185,13 @@ def _whitened(
     prior = np.zeros((len(known), problem.n_steps))
     prior[:, problem.offsets.start :] = np.diag(1 / priors)
     left = np.concatenate((table[:, 0], -known / priors))
-    return left, np.concatenate((table[:, 1:], prior))[:, problem.free]
+    return left, np.concatenate((table[:, 1:], prior))
 
 
 def _known(problem: Reprojection, state: Array) -> tuple[Array, Array]:
     """Offsets and scales, and their standard deviations before what is seen tells."""
-    _, offsets, scales = problem.split(state)
-    priors = np.full(len(offsets), OFFSET_PRIOR), np.full(len(scales), SCALE_PRIOR)
-    return np.concatenate((offsets, scales)), np.concatenate(priors)
+    counts = problem.robot.n_joints, len(problem.cameras) + 1
+    return state[16 * problem.n_poses :], np.repeat((OFFSET_PRIOR, SCALE_PRIOR), counts)
 
 
 def _noise(
@@ -190,15 +212,8 @@ def _noise(
         variance, ratio = np.exp(2 * logs[0]), np.exp(2 * (logs[1] - logs[0]))
         inside = 1 + ratio * values
         square = (total - (ratio * share / inside).sum()) / variance
-        return float(
-            (
-                errors.size * 2 * logs[0]
-                - 2 * np.log(weights).sum()
-                + np.log(inside).sum()
-                + square
-            )
-            / 2
-        )
+        log_variances = errors.size * 2 * logs[0] - 2 * np.log(weights).sum()
+        return float((log_variances + np.log(inside).sum() + square) / 2)
 
     if given is None:
         start, bounds = np.log([0.3, np.radians(0.5)]), np.log([PIXELS, JOINTS])

@@ -1,4 +1,4 @@
-"""Pictures for calibrations: of folders, videos and LeRobot data sets."""
+"""Pictures for calibrations: of boards, and of postures in LeRobot data sets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
+from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.reader import Recording
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import grey
@@ -28,60 +28,31 @@ SLOW = 0.2
 SAME = float(np.radians(2.0))
 
 
-def board_pictures(
-    source: Path, key: str, recording: Recording | None = None
-) -> dict[str, Picture]:
-    """Grey pictures by name: all of a folder, or evenly those of a video or a data set.
-
-    Parameters
-    ----------
-    source : Path
-        A folder of pictures or a video.
-    key : str
-        The camera's feature in a data set.
-    recording : Recording, optional
-        The data set, if it is one.
+def board_pictures(source: Path) -> dict[str, Picture]:
+    """Grey pictures by name: all of a folder, or evenly those of a video.
 
     Raises
     ------
     DataError
         If there are none.
     """
-    found = dict[str, Picture]()
-    if recording is not None:
-        rows = _rows(recording)
-        reader = EpisodePictures(recording.assembly.layout, [key])
-        step = max(sum(len(one.time) for one in rows) // FRAMES, 1)
-        for one in rows:
-            wanted = range(0, len(one.time), step)
-            for row, shown in reader.some(one.episode, one.time, wanted):
-                found[f"episode {one.episode.index}, row {row}"] = grey(shown[key])
-    elif source.is_dir():
+    found, step = dict[str, Picture](), 1
+    if source.is_dir():
         read = ((file.name, cv2.imread(str(file), 0)) for file in sorted(source.iterdir()))
         found = {name: picture for name, picture in read if picture is not None}
-    elif source.is_file():
-        step = 1
-        for number, (_, frame) in enumerate(frames(source, 0.0, {})):
-            if number % step == 0:
-                found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
-            if len(found) == 2 * FRAMES:
-                found, step = dict([*found.items()][::2]), 2 * step
+    for number, (_, frame) in enumerate(frames(source, 0.0, {}) if source.is_file() else ()):
+        if number % step == 0:
+            found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
+        if len(found) == 2 * FRAMES:
+            found, step = dict([*found.items()][::2]), 2 * step
     if not found:
-        raise DataError(f"{source} is no folder, video or data set with pictures")
+        raise DataError(f"{source} is no folder of pictures and no video")
     return found
 
 
-def _rows(recording: Recording) -> list[EpisodeRows]:
-    """The rows of all episodes, without pictures."""
-    assembly = recording.assembly
-    return list(
-        read_episodes(assembly.layout, recording.episodes, assembly.features, Relaxed(()))
-    )
-
-
 def slow_postures(
-    recording: Recording, keys: Mapping[str, str], most: int = POSTURES
-) -> tuple[Array, Iterator[tuple[int, dict[str, Picture]]]]:
+    recording: Recording, keys: Mapping[str, str]
+) -> tuple[Array, Iterator[dict[str, Picture]]]:
     """Postures where a robot moves slowly, those that differ most, and pictures there.
 
     Parameters
@@ -89,34 +60,33 @@ def slow_postures(
     recording : Recording
     keys : mapping of str to str
         Features of cameras by their names.
-    most : int, default=60
-        Postures at most.
 
     Returns
     -------
     joints : ndarray of shape (n, n_joints)
         [rad]
-    pictures : iterator of (int, dict)
-        The number of the posture, and pictures by the names of cameras.
+    pictures : iterator of dict
+        Of each posture the pictures by the names of cameras.
     """
-    assembly, rows = recording.assembly, _rows(recording)
-    reader = EpisodePictures(assembly.layout, list(keys.values()))
+    assembly = recording.assembly
+    layout, features = assembly.layout, assembly.features
+    rows = list(read_episodes(layout, recording.episodes, features, Relaxed(())))
+    reader = EpisodePictures(layout, list(keys.values()))
     tables = [assembly.demonstration(one).joints.double().numpy() for one in rows]
     speed = np.concatenate([
         np.abs(np.gradient(table, one.time, axis=0)).max(1) if len(table) > 1 else [0.0]
         for table, one in zip(tables, rows, strict=True)
     ])  # fmt: skip
     joints = np.concatenate(tables)
-    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[: min(LEAST_POSTURES, most)][-1]))
-    chosen = slow[spread(joints[slow], most)].tolist()
+    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[:LEAST_POSTURES][-1]))
+    chosen = slow[spread(joints[slow], POSTURES)].tolist()
 
-    def pictures() -> Iterator[tuple[int, dict[str, Picture]]]:
+    def pictures() -> Iterator[dict[str, Picture]]:
         first = 0
         for one in rows:
             wanted = [k - first for k in chosen if 0 <= k - first < len(one.time)]
-            for row, shown in reader.some(one.episode, one.time, wanted):
-                number = chosen.index(first + row)
-                yield number, {name: shown[key] for name, key in keys.items()}
+            for _, shown in reader.some(one.episode, one.time, wanted):
+                yield {name: shown[key] for name, key in keys.items()}
             first += len(one.time)
 
     return joints[chosen], pictures()

@@ -105,16 +105,15 @@ def track_lerobot(
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
     frames: dict[str, dict[int, Frame]] = {name: {} for name in names}
-    columns = {key: Column(names, {}) for key in (kept.SEEN, kept.KNOWN, kept.RESIDUAL)}
+    parts = {kept.SEEN: "seen", kept.KNOWN: "known", kept.RESIDUAL: "residuals"}
+    columns = {key: Column(names, {}) for key in parts}
     for one in reports:
-        tracks = [one.tracks[name] for name in names]
-        for name, track in zip(names, tracks, strict=True):
-            values = pose_vector(track.poses)
+        for name in names:
+            values = pose_vector(one.tracks[name].poses)
             frames[name][one.index] = Frame(values[:, :3], values[:, 3:])
-        columns[kept.SEEN].values[one.index] = np.stack([track.seen for track in tracks], 1)
-        columns[kept.KNOWN].values[one.index] = np.stack([track.known for track in tracks], 1)
-        residuals = np.stack([track.residuals for track in tracks], 1)
-        columns[kept.RESIDUAL].values[one.index] = residuals.astype(np.float32)
+        for key, part in parts.items():
+            values = [getattr(one.tracks[name], part) for name in names]
+            columns[key].values[one.index] = np.stack(values, 1)
     add_frames(folder, out, frames, columns=columns, offsets=offsets, files=files)
     return reports
 
@@ -135,13 +134,7 @@ def _offsets(
 class _Tracker:
     """Follows the objects of a cell through episodes."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        cell: Cell,
-        robot: Kinematics | None,
-        progress: Callable[[int, int], None] | None,
-    ) -> None:
+    def __init__(self, layout: Layout, cell: Cell, robot: Any, progress: Any) -> None:
         self.cell, self.robot, self.source = cell, robot, pose_source(cell, robot)
         self.pictures = EpisodePictures(layout, [one.key for one in cell.placed().values()])
         self.progress, self.done = progress or (lambda done, total: None), 0
@@ -202,9 +195,8 @@ class _Tracker:
         if robot is None or not getattr(robot, "orientation", True):  # tracked points have none
             return {}
         state = robot.state(joints.to(robot.lower))
-        poses = {link: (state.position(link), state.orientation(link)) for link in robot.links}
-        joined = {link: torch.cat(pose, -1).double() for link, pose in poses.items()}
-        return {link: pose_matrix(pose.numpy()) for link, pose in joined.items()}
+        poses = torch.cat((state.positions, state.orientations), -1).double().numpy()
+        return dict(zip(robot.links, pose_matrix(poses).swapaxes(0, 1), strict=True))
 
     def _expected(
         self, report: EpisodeReport, row: int, camera: str, place: Array

@@ -52,11 +52,9 @@ class EpisodePictures:
         self.layout, self.keys = layout, tuple(keys)
         there = [key for key, feature in layout.features.items() if feature.is_camera]
         if missing := [key for key in keys if key not in there]:
-            raise DatasetError(
-                f"the set has no pictures {missing}; its cameras are {there}. The cell says "
-                "which camera is meant, in 'key'",
-                file="meta/info.json",
-            )
+            remedy = "The cell says which camera is meant, in 'key'"
+            message = f"the set has no pictures {missing}; its cameras are {there}. {remedy}"
+            raise DatasetError(message, file="meta/info.json")
         self.videos = [key for key in keys if layout.features[key].dtype == "video"]
         self._places = dict[tuple[str, int], list[Any]]()
         for path in chunked_files(layout.root / "meta" / "episodes"):  # of v3.0
@@ -81,9 +79,7 @@ class EpisodePictures:
             If a video or an image is missing or damaged, or a video does not fit the rows.
         """
         streams = [
-            self._video(key, episode, time)
-            if key in self.videos
-            else self._images(key, episode, len(time))
+            (self._video if key in self.videos else self._images)(key, episode, time)
             for key in self.keys
         ]
         for pictures in zip(*streams, strict=True):
@@ -100,6 +96,7 @@ class EpisodePictures:
 
     def _video(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         layout, period = self.layout, 1 / self.layout.fps
+        place: Any
         *place, start, stop = self._places.get((key, episode.index), [0.0, len(time) * period])
         file = episode_file(layout.info, "video_path", episode.index, place, video_key=key)
         where: dict[str, Any] = {"file": file, "episode": episode.index, "column": key}
@@ -122,7 +119,7 @@ class EpisodePictures:
             message = f"no picture is at {start + time[row]:.4f} s of the video, where row "
             raise _unlike(f"{message}{row} is; the last is at {at:.4f} s", where)
 
-    def _images(self, key: str, episode: Episode, rows: int) -> Iterator[Picture]:
+    def _images(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         root, count = self.layout.root, 0
         where: dict[str, Any] = {"file": episode.file, "episode": episode.index, "column": key}
         batches = dataset(root / episode.file).to_batches(
@@ -132,8 +129,8 @@ class EpisodePictures:
         for stored in (one for batch in batches for one in batch[key].to_pylist()):
             yield _decoded(stored, root, where)
             count += 1
-        if count != rows:
-            raise _unlike(f"there are {count} images for {rows} rows", where)
+        if count != len(time):
+            raise _unlike(f"there are {count} images for {len(time)} rows", where)
 
 
 def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
