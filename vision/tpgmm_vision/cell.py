@@ -186,13 +186,10 @@ class Cell:
         DataError
             If one has none, or there are none.
         """
-        missing = [name for name, one in self.cameras.items() if one.pose is None]
-        if missing or not self.cameras:
-            raise DataError(
-                f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
-                if missing
-                else "the cell has no cameras: tpgmm calibrate camera adds one"
-            )
+        if not self.cameras:
+            raise DataError("the cell has no cameras: tpgmm calibrate camera adds one")
+        if missing := [name for name, one in self.cameras.items() if one.pose is None]:
+            raise DataError(f"cameras {missing} of the cell have no pose: tpgmm calibrate cell")
         return dict(self.cameras)
 
 
@@ -216,9 +213,8 @@ def check_robot(cell: Cell, robot: Any) -> None:
     )
     if not (ours <= theirs or theirs <= ours):
         raise DataError(
-            f"the cell was calibrated with another robot: it has the joints "
-            f"{list(cell.joints)}, this one has {list(robot.joint_names)}: it needs a cell of "
-            "its own, tpgmm calibrate cell"
+            f"the cell is that of another robot, with the joints {list(cell.joints)}, this one "
+            f"has {list(robot.joint_names)}: make its own by tpgmm calibrate cell"
         )
     for link in cell.links:
         if link not in robot.links:
@@ -289,9 +285,7 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
     })  # fmt: skip
     cell = Cell(**made, content=content)
     if "joints" in made and (extra := cell.joint_offsets.keys() - set(cell.joints)):
-        raise DataError(
-            f"{where}: joint_offsets of {sorted(extra)}, which are not among joints"
-        )
+        raise DataError(f"{where}: joint_offsets of {sorted(extra)}, not among the joints")
     _check_unique(cell, where)
     return cell
 

@@ -10,12 +10,11 @@ from itertools import pairwise, starmap
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
 from tpgmm_datasets.least_squares import levenberg_marquardt
-from tpgmm_vision.calibration.reprojection import Reprojection
+from tpgmm_vision.calibration.reprojection import Integers, Reprojection
 from tpgmm_vision.poses import Array
 
 __all__ = ["Adjustment", "Noise", "adjust"]
@@ -57,8 +56,6 @@ class Adjustment:
     left, jacobian : ndarray of shape (n,) and (n, n_steps)
         Errors in units of their noise, 2 N of corners and those of offsets and scales from
         what is known before, and how steps lessen them.
-    surprise : float
-        Minus the logarithm of the likelihood, and of what is known before.
     """
 
     problem: Reprojection
@@ -67,7 +64,6 @@ class Adjustment:
     misfit: Array
     left: Array
     jacobian: Array
-    surprise: float
 
     def covariance(self) -> Array:
         """Of the entries of a step (n_steps, n_steps), zero where they are not free."""
@@ -145,7 +141,7 @@ def adjust(
             break
         last = surprise
     left, jacobian = _whitened(problem, state, _whitening(problem, state, found, weights))
-    return Adjustment(problem, state, found, misfit, left, jacobian, surprise)
+    return Adjustment(problem, state, found, misfit, left, jacobian)
 
 
 def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
@@ -154,20 +150,26 @@ def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
     return problem.corners.pixels - pixels, jacobian
 
 
+def _covariances(
+    problem: Reprojection, jacobian: Array, noise: Noise, weights: Array, starts: Integers
+) -> list[tuple[slice, Array]]:
+    """The covariances of errors of the corners from each of these to the next [pixels^2]."""
+    moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
+    variance = noise.pixels**2 / np.repeat(weights, 2)
+    blocks = starmap(slice, pairwise((2 * starts).tolist()))
+    return [(own, np.diag(variance[own]) + moved[own] @ moved[own].T) for own in blocks]
+
+
 def _whitening(
     problem: Reprojection, state: Array, noise: Noise, weights: Array
 ) -> list[tuple[slice, Array]]:
     """For the corners of each posture a matrix that makes their noise independent."""
     _, jacobian = _errors(problem, state)
-    moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
-    variance, made = noise.pixels**2 / np.repeat(weights, 2), []
-    for own in starmap(slice, pairwise(2 * _starts(problem))):
-        covariance = np.diag(variance[own]) + moved[own] @ moved[own].T
-        made.append((own, np.linalg.inv(np.linalg.cholesky(covariance))))
-    return made
+    blocks = _covariances(problem, jacobian, noise, weights, _starts(problem))
+    return [(own, np.linalg.inv(np.linalg.cholesky(block))) for own, block in blocks]
 
 
-def _starts(problem: Reprojection) -> NDArray[np.int_]:
+def _starts(problem: Reprojection) -> Integers:
     """Where the corners of each posture begin, and their number."""
     postures = problem.corners.posture
     changes = np.flatnonzero(np.diff(postures)) + 1
@@ -199,21 +201,14 @@ def _noise(
 ) -> tuple[Noise, float]:
     """The likeliest noise, or what is given, and minus the logarithm of the likelihood."""
     errors, jacobian = _errors(problem, state)
-    by_joint = jacobian[..., problem.offsets].reshape(len(errors), 2, -1)
-    starts = _starts(problem)[:-1]
-    inner = np.einsum("ncj,nck,n->njk", by_joint, by_joint, weights)
-    share = np.einsum("ncj,nc,n->nj", by_joint, errors, weights)
-    values, vectors = np.linalg.eigh(np.add.reduceat(inner, starts))
-    values = values.clip(0)
-    share = np.einsum("kji,kj->ki", vectors, np.add.reduceat(share, starts)) ** 2
-    total = float((weights[:, None] * errors**2).sum())
+    errors, starts = errors.ravel(), _starts(problem)
 
     def surprise(logs: Array) -> float:
-        variance, ratio = np.exp(2 * logs[0]), np.exp(2 * (logs[1] - logs[0]))
-        inside = 1 + ratio * values
-        square = (total - (ratio * share / inside).sum()) / variance
-        log_variances = errors.size * 2 * logs[0] - 2 * np.log(weights).sum()
-        return float((log_variances + np.log(inside).sum() + square) / 2)
+        blocks = _covariances(problem, jacobian, Noise(*np.exp(logs)), weights, starts)
+        return sum(
+            np.linalg.slogdet(block)[1] + errors[own] @ np.linalg.solve(block, errors[own])
+            for own, block in blocks
+        ) / 2  # fmt: skip
 
     if given is None:
         start, bounds = np.log([0.3, np.radians(0.5)]), np.log([PIXELS, JOINTS])
@@ -227,8 +222,6 @@ def _noise(
 def _misfit(problem: Reprojection, state: Array, noise: Noise) -> Array:
     """Mean square deviation of each tag in each picture, in units of what noise explains."""
     errors, jacobian = _errors(problem, state)
-    errors = errors.reshape(-1, 8)
-    moved = noise.joints * jacobian[..., problem.offsets].reshape(len(errors), 8, -1)
-    covariance = noise.pixels**2 * np.eye(8) + moved @ moved.swapaxes(1, 2)
-    solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
-    return np.asarray((errors * solved).mean(1))
+    errors, n = errors.ravel(), len(errors)
+    blocks = _covariances(problem, jacobian, noise, np.ones(n), np.arange(0, n + 1, 4))
+    return np.array([errors[own] @ np.linalg.solve(b, errors[own]) / 8 for own, b in blocks])

@@ -26,11 +26,8 @@ from tpgmm_vision.targets import Target
 
 __all__ = ["CellCalibration", "Mount", "calibrate_cell"]
 
-#: Closed forms of OpenCV for the camera on a hand; none is best everywhere.
-CLOSED_FORMS = (
-    cv2.CALIB_HAND_EYE_PARK, cv2.CALIB_HAND_EYE_TSAI, cv2.CALIB_HAND_EYE_HORAUD,
-    cv2.CALIB_HAND_EYE_DANIILIDIS,
-)  # fmt: skip
+#: Closed forms of OpenCV for the camera on a hand, from Tsai's to Daniilidis'; none is best.
+CLOSED_FORMS = range(5)
 #: Pictures of each camera at least, and parts of them that are left out in turns.
 LEAST_PICTURES, FOLDS = 8, 5
 #: A tag whose corners are this many times further off than noise explains is a wrong one.

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.calibration.recorded import spread
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.poses import Array
@@ -20,8 +19,8 @@ from tpgmm_vision.targets import Board
 
 __all__ = ["CameraCalibration", "calibrate_camera"]
 
-#: Pictures at least and at most, corners in each at least, and parts left out in turns.
-LEAST_PICTURES, MOST_PICTURES, LEAST_CORNERS, FOLDS = 8, 40, 8, 4
+#: Pictures at least, corners in each at least, and parts left out in turns.
+LEAST_PICTURES, LEAST_CORNERS, FOLDS = 8, 8, 4
 #: The picture is divided into so many fields to a side, of which so many must have corners.
 FIELDS, LEAST_COVERED = 4, 12
 #: Sides from which the board is seen differ at least by this, root mean square [rad]: seen from
@@ -79,7 +78,7 @@ def calibrate_camera(
     Parameters
     ----------
     pictures : mapping of str to ndarray of uint8, shape (height, width, 3) or (height, width)
-        By name; of many, those are taken that differ most.
+        By name.
     board : Board
         Its size does not matter, its shape does.
 
@@ -146,18 +145,7 @@ def _views(
         start = np.ascontiguousarray(corners - np.float32(0.5))
         pixels = cv2.cornerSubPix(image, start, (window, window), (-1, -1), ENDS)
         found[name] = points.reshape(-1, 3), pixels.reshape(-1, 2)
-    names, away = list(found), np.array([_corners_of(*view) for view in found.values()])
-    if len(found) <= MOST_PICTURES:
-        return found, without
-    return {names[k]: found[names[k]] for k in spread(away, MOST_PICTURES, 0.0)}, without
-
-
-def _corners_of(points: Array, pixels: Array) -> Array:
-    """Where the corners of a square on the board are in the picture (8,) [pixels]."""
-    extent = np.ptp(points[:, :2], axis=0).max()
-    plane, _ = cv2.findHomography(points[:, :2] / extent, pixels)
-    square = np.array([[[0, 0], [1, 0], [1, 1], [0, 1.0]]])
-    return np.asarray(cv2.perspectiveTransform(square, plane).ravel())
+    return found, without
 
 
 def _check_covered(views: Views, size: Sequence[int]) -> None:
@@ -181,11 +169,9 @@ def _fitted(
         points, pixels, size, None, None, flags=flags, criteria=ENDS
     )
     _, matrix, lens, turns, _, spread, _, errors = found
-    camera = Camera(
-        int(size[0]), int(size[1]), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]),
-        tuple(lens.ravel()[:5].tolist()),
-    )  # fmt: skip
-    uncertain = float((spread.ravel()[:2] / np.diag(matrix)[:2]).max())
+    lengths, centre = np.diag(matrix)[:2], matrix[:2, 2]
+    camera = Camera(size[0], size[1], tuple(lengths), tuple(centre), tuple(lens.ravel()[:5]))
+    uncertain = float((spread.ravel()[:2] / lengths).max())
     per_picture = dict(zip(views, errors.ravel().tolist(), strict=True))
     return camera, per_picture, np.array(turns).reshape(-1, 3), uncertain
 

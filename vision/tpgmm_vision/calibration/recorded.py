@@ -18,9 +18,9 @@ from tpgmm_vision.poses import Array
 
 __all__ = ["board_pictures", "slow_postures", "spread"]
 
-#: Pictures of a video that are looked at, and postures of a recording; of so many at least the
+#: Pictures of a video at least, if it has as many, up to twice that; and postures of a recording; of so many at least the
 #: robot may move faster than it should.
-FRAMES, POSTURES, LEAST_POSTURES = 200, 60, 15
+FRAMES, POSTURES, LEAST_POSTURES = 40, 60, 15
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
 SLOW = 0.2
@@ -85,7 +85,7 @@ def slow_postures(
         first = 0
         for one in rows:
             wanted = [k - first for k in chosen if 0 <= k - first < len(one.time)]
-            for _, shown in reader.some(one.episode, one.time, wanted):
+            for _, shown in reader.read(one.episode, one.time, wanted):
                 yield {name: shown[key] for name, key in keys.items()}
             first += len(one.time)
 

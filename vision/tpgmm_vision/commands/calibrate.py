@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import typer
 from rich.progress import Progress
 
 from tpgmm_tools.cli import options
-from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["app"]
@@ -55,10 +53,11 @@ def camera(
     """
     from tpgmm_vision.calibration.intrinsics import calibrate_camera
     from tpgmm_vision.calibration.recorded import board_pictures
-    from tpgmm_vision.cell import camera_content, write_cell
+    from tpgmm_vision.cell import camera_content, read_cell, write_cell
     from tpgmm_vision.targets import Board
 
-    content, key = _content(cell), key or f"observation.images.{name}"
+    key = key or f"observation.images.{name}"
+    content: dict[str, Any] = dict(read_cell(cell).content) if cell.exists() else {}
     result = calibrate_camera(board_pictures(pictures), Board(columns, rows, family=family))
     entry = camera_content(result.camera, key) | ({"link": link} if link else {})
     content.setdefault("cameras", {})[name] = entry | {"report": str(result)}
@@ -124,7 +123,8 @@ def cell(
     from tpgmm_vision.episodes.report import drawn
     from tpgmm_vision.targets import target_from
 
-    known, content = read_cell(cell).cameras, _content(cell)
+    before = read_cell(cell)
+    known, content = before.cameras, dict(before.content)
     if unknown := [name for name in camera or () if name not in known]:
         raise UnknownNameError("camera", unknown[0], "the cell", known)
     cameras = {name: known[name] for name in camera or known}
@@ -133,8 +133,8 @@ def cell(
         name: Mount(target_from(entry, name), name if name in hands else None)
         for name, entry in {**checks, **hands}.items()
     }
-    links = {mount.link for mount in mounts.values()} | {one.link for one in cameras.values()}
-    wanted = {*(described.link or ()), *(link for link in links if link)}
+    carriers = {one.link for one in cameras.values() if one.link}
+    wanted = carriers.union(hands, described.link or ())
     robot = replace(described, link=sorted(wanted)).read()
     if robot is None or not cameras or not mounts:
         raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
@@ -188,12 +188,3 @@ def _target(text: str) -> tuple[str, dict[str, Any]]:
             f"tags are described as NAME=cube:10,11,12,13,14:0.03 or NAME=tag:3:0.04 (numbers, "
             f"and the edge in metres), got {text!r}"
         ) from error
-
-
-def _content(path: Path) -> dict[str, Any]:
-    """What is in a cell file; nothing if there is none."""
-    from tpgmm_vision.cell import cell_from
-
-    content: dict[str, Any] = json.loads(read_whole(path)) if path.exists() else {}
-    cell_from(content, str(path))
-    return content

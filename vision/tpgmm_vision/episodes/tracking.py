@@ -109,8 +109,8 @@ def track_lerobot(
     columns = {key: Column(names, {}) for key in parts}
     for one in reports:
         for name in names:
-            values = pose_vector(one.tracks[name].poses)
-            frames[name][one.index] = Frame(values[:, :3], values[:, 3:])
+            poses = pose_vector(one.tracks[name].poses)
+            frames[name][one.index] = Frame(poses[:, :3], poses[:, 3:])
         for key, part in parts.items():
             values = [getattr(one.tracks[name], part) for name in names]
             columns[key].values[one.index] = np.stack(values, 1)
@@ -155,7 +155,7 @@ class _Tracker:
                 message = f"object {name!r}: {error}"
                 raise DatasetError(message, episode=report.index) from error
         wanted = report.rows_to_show()
-        for row, images in self.pictures.some(rows.episode, rows.time, wanted):
+        for row, images in self.pictures.read(rows.episode, rows.time, wanted):
             for name, place in camera_poses(self.cell, self.robot, named[row]).items():
                 expected = self._expected(report, row, name, place)
                 picture = images[self.cell.cameras[name].key]
@@ -170,7 +170,7 @@ class _Tracker:
         """Put what the source measures into tracks; corners that it saw, by row and camera."""
         corners = list[dict[str, dict[int, Array]]]()
         self.source.reset()
-        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
+        for row, images in self.pictures.read(rows.episode, rows.time):
             now, source = float(rows.time[row]), self.source
             for name, one in source.poses(images, joints[row], now).items():
                 track = report.tracks.setdefault(name, Track(rows.time))

@@ -64,14 +64,18 @@ class EpisodePictures:
                 for index, *place in zip(*table.to_pydict().values(), strict=True):
                     self._places[key, index] = place
 
-    def read(self, episode: Episode, time: Array) -> Iterator[dict[str, Picture]]:
-        """The pictures of each row of an episode, RGB of shape (height, width, 3), by key.
+    def read(
+        self, episode: Episode, time: Array, rows: Collection[int] | None = None
+    ) -> Iterator[tuple[int, dict[str, Picture]]]:
+        """Rows of an episode with their pictures, RGB of shape (height, width, 3), by key.
 
         Parameters
         ----------
         episode : Episode
         time : ndarray of shape (T,)
             Of its rows, from its start [s].
+        rows : collection of int, optional
+            Which are wanted; by default all.
 
         Raises
         ------
@@ -82,17 +86,10 @@ class EpisodePictures:
             (self._video if key in self.videos else self._images)(key, episode, time)
             for key in self.keys
         ]
-        for pictures in zip(*streams, strict=True):
-            yield dict(zip(self.keys, pictures, strict=True))
-
-    def some(
-        self, episode: Episode, time: Array, rows: Collection[int]
-    ) -> Iterator[tuple[int, dict[str, Picture]]]:
-        """Some rows of an episode, in ascending order, and their pictures, as of ``read``."""
-        pictures = enumerate(self.read(episode, time))
-        for row, shown in islice(pictures, max(rows, default=-1) + 1):
-            if row in rows:
-                yield row, shown
+        stop = None if rows is None else max(rows, default=-1) + 1
+        for row, pictures in enumerate(islice(zip(*streams, strict=True), stop)):
+            if rows is None or row in rows:
+                yield row, dict(zip(self.keys, pictures, strict=True))
 
     def _video(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         layout, period = self.layout, 1 / self.layout.fps
