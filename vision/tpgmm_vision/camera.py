@@ -90,7 +90,6 @@ class Camera:
         """
         if picture.shape[:2] != (self.height, self.width):
             raise DataError(
-                f"camera {name!r} was calibrated for {self.width} x {self.height} pixels, "
-                f"got {picture.shape[1]} x {picture.shape[0]}: calibrate it again at this "
-                "size, or set the camera to the other"
+                f"camera {name!r} was calibrated for {self.width} x {self.height} pixels, got "
+                f"{picture.shape[1]} x {picture.shape[0]}: calibrate it again, or change it"
             )

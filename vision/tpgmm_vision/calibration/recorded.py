@@ -18,8 +18,8 @@ from tpgmm_vision.poses import Array
 
 __all__ = ["board_pictures", "slow_postures", "spread"]
 
-#: Pictures of a video at least, if it has as many, up to twice that; and postures of a recording; of so many at least the
-#: robot may move faster than it should.
+#: Pictures of a longer video, up to twice as many, and postures of a recording; in so many at
+#: least the robot may move faster than it should.
 FRAMES, POSTURES, LEAST_POSTURES = 40, 60, 15
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
