@@ -20,7 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINKED = ("tpgmm_torch", "datasets", "tools", "vision", "policies", "environments", "evaluation", "tests")
+LINKED = (
+    "tpgmm_torch",
+    "datasets",
+    "tools",
+    "vision",
+    "policies",
+    "environments",
+    "evaluation",
+    "tests",
+)
 
 #: A mutant is equivalent by rule if its line is the original one once these are blanked.
 #: mutmut leaves alone annotations, docstrings, defaults other than numbers and names,

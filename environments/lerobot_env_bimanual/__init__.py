@@ -17,12 +17,13 @@ from lerobot_env_bimanual.aloha.robot import JOINTS, OBJECTS
 from lerobot_env_bimanual.control_rate import rate_processors
 from lerobot_env_bimanual.disturbances import NOMINAL
 from lerobot_env_bimanual.metaworld.tasks import check_task
+from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
-    "AlohaStateConfig", "BimanualConfig", "BottleShakingConfig", "BottleTorqueConfig",
-    "CarryAndPutConfig", "MetaworldStateConfig",
+    "AlohaStateConfig", "BiSo101Config", "BimanualConfig", "BottleShakingConfig",
+    "BottleTorqueConfig", "CarryAndPutConfig", "MetaworldStateConfig",
 ]  # fmt: skip
 
 _PACKAGE = "lerobot_env_bimanual"
@@ -33,6 +34,7 @@ _ENVIRONMENTS = {
     "BottleTorque-v0": "bottle.torque:BottleTorqueEnv",
     "CarryAndPut-v0": "bottle.carrying:CarryAndPutEnv",
     "Bimanual-v0": "suite.env:SuiteEnv",
+    "BiSo101-v0": "so101.env:BiSo101Env",
     "AlohaState-v0": "aloha.state:AlohaStateEnv",
     "MetaworldState-v0": "metaworld.state:MetaworldStateEnv",
 }
@@ -234,6 +236,37 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
         self._observe(SUITE, ROBOTS[self.robot])
+        super().__post_init__()
+
+
+@EnvConfig.register_subclass("bi_so101")
+@dataclass
+class BiSo101Config(_ControlledEnvConfig, _TaskEnvConfig):
+    """``--env.type=bi_so101``: two SO-101 arms, in the units of LeRobot's ``bi_so_follower``.
+
+    Parameters
+    ----------
+    task : str, default="cup_on_saucer"
+    specimen : int, default=0
+        Which pair of arms: the seed of the joints' offsets.
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, episode_length, pushes, noise, condition, cameras, camera_width, camera_height, \
+    observe_objects
+        Options of :class:`~lerobot_env_bimanual.so101.env.BiSo101Env`; its own defaults where
+        None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    environment: ClassVar[str] = "BiSo101-v0"
+
+    task: str | None = "cup_on_saucer"
+    specimen: int = 0
+    fps: int = 25
+
+    def __post_init__(self) -> None:
+        self._observe(TASKS, N_JOINTS)
         super().__post_init__()
 
 

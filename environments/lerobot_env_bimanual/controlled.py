@@ -23,8 +23,8 @@ from lerobot_env_bimanual.disturbances import (
 )
 from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.eyes.lens import usual_camera
-from lerobot_env_bimanual.eyes.rig import Rig
-from lerobot_env_bimanual.eyes.views import CHECK, chosen_views
+from lerobot_env_bimanual.eyes.rig import Rig, View
+from lerobot_env_bimanual.eyes.views import CHECK, VIEWS, chosen_views
 from lerobot_env_bimanual.robot_scene import CAMERA, RobotScene
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Robot
@@ -100,6 +100,14 @@ class ControlledEnv(StateEnv):
         If an option is not one of the above.
     """
 
+    #: How data sets are recorded: what LeRobot calls the robot, if not as the environment does;
+    #: what follows the names of joints; their units, empty to declare none.
+    robot_type: ClassVar[str | None] = None
+    suffix: ClassVar[str] = ""
+    units: ClassVar[Sequence[str] | None] = None
+    #: Where cameras are, by their names, and tags that stand still.
+    views: ClassVar[Mapping[str, View]] = VIEWS
+    checks: ClassVar[Mapping[str, Carrier]] = CHECK
     #: The tags of the objects, by their names.
     carriers: ClassVar[Mapping[str, Carrier]] = {}
 
@@ -177,10 +185,15 @@ class ControlledEnv(StateEnv):
             ``imperfections``.
         """
         usual: dict[str, Any] = {
-            "carriers": {**CHECK, **self.carriers},
+            "carriers": {**self.checks, **self.carriers},
             "camera": usual_camera(*size),
         }
-        return Rig(self._scene, chosen_views(cameras), **usual | options)
+        views = {name: self.views[name] for name in chosen_views(cameras)}
+        return Rig(self._scene, views, **usual | options)
+
+    def cell_of_joints(self) -> dict[str, Any]:
+        """What a cell file says of the joints."""
+        return {"joints": list(self.joint_names)}
 
     def close(self) -> None:
         """Free what the graphics library holds."""

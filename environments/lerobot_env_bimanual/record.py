@@ -11,7 +11,7 @@ import argparse
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,9 @@ from lerobot_env_bimanual.eyes.recorder import CODECS, recording, row
 from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
+from lerobot_env_bimanual.so101 import TASKS
+from lerobot_env_bimanual.so101.env import BiSo101Env
+from lerobot_env_bimanual.so101.expert import teleoperated
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
@@ -62,11 +65,29 @@ class Expert:
         The demonstration that belongs to a seed.
     objects : tuple of str
         What is observed.
+    actions : callable, optional
+        In place of motions: the actions in an episode that has begun, one by one.
     """
 
     environment: Callable[..., ControlledEnv]
-    motion: Callable[[int], Demonstration]
+    motion: Callable[[int], Demonstration] | None
     objects: tuple[str, ...]
+    actions: Callable[[Any, np.random.Generator], Iterable[Vector]] | None = None
+
+    def begin(
+        self, env: ControlledEnv, rng: np.random.Generator
+    ) -> tuple[dict[str, Any], Iterable[Vector]]:
+        """Begin an episode: what is observed, and the actions."""
+        motion = self.motion(int(rng.integers(2**31))) if self.motion else None
+        start, seed = {} if motion is None else self.start(motion), int(rng.integers(2**31))
+        observation, _ = env.reset(seed=seed, options=start)
+        if motion is None:
+            assert self.actions is not None
+            return observation, self.actions(env, rng)
+        time = motion.time.numpy()
+        ticks = np.arange(1, int(time[-1] * env.fps + 1e-6) + 2) / env.fps
+        ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
+        return observation, np.stack(ways, axis=1)
 
     def start(self, motion: Demonstration) -> dict[str, Any]:
         """The options with which an episode begins as a demonstration does."""
@@ -95,11 +116,11 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
         made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
         return Expert(made, lambda seed: of(1, seed)[0], able.objects)
     if robot != UPPER_BODY:
-        raise DataError(f"{task} is done by {UPPER_BODY} alone, not by {robot!r}")
-    return BOTTLES[task]
+        raise DataError(f"{task} is done by its own robot alone, not by {robot!r}")
+    return ALONE[task]
 
 
-BOTTLES = {
+ALONE = {
     "bottle_shaking": Expert(
         partial(BottleShakingEnv, track=True),
         lambda seed: BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(1, seed)[0],
@@ -110,9 +131,10 @@ BOTTLES = {
         lambda seed: CarryAndPut(rate=RATE).demonstrations(1, seed)[0],
         ("bottle", "tray"),
     ),
+    "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperated),
 }
 #: What can be recorded.
-EXPERTS = (*BOTTLES, *SUITE)
+EXPERTS = (*ALONE, *SUITE)
 
 
 def record(
@@ -203,17 +225,19 @@ def record(
     if not rig.views:
         raise DataError("a set with videos needs a camera: --cameras front")
     env.reset(seed=seed)
-    cell = {**rig.content(), "joints": list(names)}
+    cell = {**rig.content(), **env.cell_of_joints()}
     if shows:
         moved = calibration.chain_of(rig, hand)
         offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
         cell |= {"joint_offsets": {names[one]: float(offsets[one]) for one in moved}}
     settings: dict[str, Any] = {
         "objects": able.objects if true_poses else (),
-        "robot_type": robot,
+        "robot_type": env.robot_type or robot,
+        "units": env.units,
     }
     sizes = dict.fromkeys(rig.views, size)
-    with recording(out, fps, names, sizes, cell, codec=codec, **settings) as opened:
+    called = [name + env.suffix for name in names]
+    with recording(out, fps, called, sizes, cell, codec=codec, **settings) as opened:
         if shows:
             postures = calibration.varied_postures(rig, hand, n, rng)
 
@@ -246,12 +270,8 @@ def _demonstrate(
     for number in range(ATTEMPTS * n):
         # each has numbers of its own: episode 3 is the same, however many there are
         rng = np.random.default_rng((seed, number))
-        motion = able.motion(int(rng.integers(2**31)))
-        start, time, over = able.start(motion), motion.time.numpy(), False
-        observation, info = env.reset(seed=int(rng.integers(2**31)), options=start)
-        ticks = np.arange(1, int(time[-1] * env.fps + 1e-6) + 2) / env.fps
-        ways = [np.interp(ticks, time, column) for column in motion.joints.numpy().T]
-        for reference in np.stack(ways, axis=1):
+        (observation, actions), over = able.begin(env, rng), False
+        for reference in actions:
             poses = observation["environment_state"] if true_poses else None
             seen, joints = rig.pictures(rng), observation["agent_pos"]
             opened.add_frame(row(env.task_description, joints, reference, seen, poses))

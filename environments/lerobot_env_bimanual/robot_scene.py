@@ -16,7 +16,8 @@ from tpgmm_torch.exceptions import DataError
 
 __all__ = [
     "BOX", "CAMERA", "CYLINDER", "DAMPING", "PALM", "PALM_SIZE", "STIFFNESS", "TABLE",
-    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_weld", "controlled", "robot_spec",
+    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_view", "add_weld", "controlled",
+    "robot_spec",
 ]  # fmt: skip
 
 #: Of the simulation and of the position control of the joints [s].
@@ -73,12 +74,12 @@ def controlled(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpec:
     for hand in HANDS:
         palm = spec.body(hand).geoms[0]
         palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", PALM, (0.85, 0.45, 0.2, 1)
-    _add_view(spec)
+    add_view(spec)
     return spec
 
 
-def _add_view(spec: Any) -> None:
-    """A camera before the robot, light and a bright sky: cheap to draw by a processor."""
+def add_view(spec: Any) -> None:
+    """Add a camera before the robot, light and a bright sky: cheap to draw by a processor."""
     spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
     world, texture = spec.worldbody, mujoco.mjtTexture
     world.add_camera(
@@ -117,7 +118,7 @@ def add_weld(spec: Any, hand: str, thing: str) -> Any:
 
 
 class RobotScene(ABC):
-    """A simulated world with the robot in it, whose joints come first.
+    """A simulated world with the robot in it.
 
     Parameters
     ----------
@@ -136,6 +137,9 @@ class RobotScene(ABC):
         self.spec, self.model = spec, spec.compile()
         self.data = mujoco.MjData(self.model)
         self._n = self.model.nu
+        driven = self.model.actuator_trnid[:, 0]
+        # of what is driven, among all positions and velocities
+        self._places, self._dofs = self.model.jnt_qposadr[driven], self.model.jnt_dofadr[driven]
 
     @property
     @abstractmethod
@@ -157,7 +161,7 @@ class RobotScene(ABC):
     @property
     def joints(self) -> NDArray[np.float64]:
         """Joint positions, shape (n_joints,) [rad]."""
-        return self.data.qpos[: self._n].copy()
+        return np.asarray(self.data.qpos[self._places])
 
     def follow(
         self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
@@ -171,11 +175,11 @@ class RobotScene(ABC):
         torques : ndarray of shape (n, n_joints), optional
             From outside, during each time step [N m].
         """
-        model, data, n = self.model, self.data, self._n
+        model, data = self.model, self.data
         control = self._controls(references[1:], np.diff(references, axis=0) / TIMESTEP)
         for i in range(len(control)):
             if torques is not None:
-                data.qfrc_applied[:n] = torques[i]
+                data.qfrc_applied[self._dofs] = torques[i]
             self._step(control[i])
         if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
             raise DataError(f"the simulation diverges at {references[-1].tolist()}")
@@ -188,7 +192,7 @@ class RobotScene(ABC):
         # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
         # is its damping, the joint's own and the control's: so much it has to be led
         model = self.model
-        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
+        damping = model.dof_damping[self._dofs] - model.actuator_biasprm[:, 2]
         return references + damping / model.actuator_gainprm[:, 0] * speeds
 
     def _step(self, control: NDArray[np.float64]) -> None:
@@ -199,7 +203,7 @@ class RobotScene(ABC):
         """Stand still, as it is."""
         data = self.data
         data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
-        data.ctrl[:] = data.qpos[: self._n]
+        data.ctrl[:] = self.joints
         mujoco.mj_forward(self.model, data)
 
     def _attach(self, weld: int, hand: int, thing: int) -> None:

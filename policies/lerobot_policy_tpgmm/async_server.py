@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import draccus
+from lerobot.async_inference import helpers
 from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.constants import SUPPORTED_POLICIES
 from lerobot.async_inference.policy_server import serve
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from tpgmm_torch.exceptions import DataError
 
 __all__ = ["main"]
 
@@ -26,6 +29,22 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 # LeRobot asks a list of its own, which plugins are not put into
 if TPGMMConfig.get_choice_name(TPGMMConfig) not in SUPPORTED_POLICIES:
     SUPPORTED_POLICIES.append(TPGMMConfig.get_choice_name(TPGMMConfig))
+
+
+_resized = helpers.resize_robot_observation_image
+
+
+def _as_it_is(image: Any, wanted: Sequence[int]) -> Any:
+    """A picture (3, height, width) of the size that its camera was calibrated for."""
+    if tuple(image.shape[:2]) != tuple(wanted[1:]):
+        raise DataError(
+            f"a camera gives pictures of {image.shape[1]} x {image.shape[0]}, it was "
+            f"calibrated for {wanted[2]} x {wanted[1]} in the policy's cell: set it to that"
+        )
+    return _resized(image, wanted)
+
+
+helpers.resize_robot_observation_image = _as_it_is
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -6,9 +6,12 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_bimanual import record as module
 from lerobot_env_bimanual.record import EXPERTS, expert, main
+from lerobot_env_bimanual.rendering import offscreen
 from tpgmm_datasets import load_lerobot
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_vision.cell import read_cell
+
+pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
 SMALL = ["--size", "160", "120", "--fps", "25"]
 

@@ -10,6 +10,7 @@ from concurrent import futures
 import grpc
 import pytest
 import torch
+from lerobot.async_inference import helpers
 from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
 from lerobot.transport import services_pb2, services_pb2_grpc
@@ -18,6 +19,7 @@ from lerobot.transport.utils import send_bytes_in_chunks
 from tests.support.lerobot_commands import PLUGINS
 from tests.support.policies import STATE, batch, changed, fitted, pose
 from tests.support.skills import bottle_demonstrations
+from tpgmm_torch.exceptions import DataError
 
 POSE = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 NAMES = [f"{name}.pos" for name in fitted().kinematics.joint_names]
@@ -82,6 +84,13 @@ def observed(state):
     """Of joints and of the bottle, by name."""
     bottle = pose(bottle_demonstrations()[5].frames["bottle"])
     return dict(zip(NAMES + POSE, [*state.tolist(), *bottle.tolist()], strict=True))
+
+
+def test_pictures_are_not_resized():
+    picture = torch.zeros(48, 64, 3, dtype=torch.uint8)
+    assert helpers.resize_robot_observation_image(picture, (3, 48, 64)).shape == (3, 48, 64)
+    with pytest.raises(DataError, match="64 x 48, it was calibrated for 32 x 24"):
+        helpers.resize_robot_observation_image(picture, (3, 24, 32))
 
 
 def test_chunks_come_over_the_wire_and_go_on(address, tmp_path):

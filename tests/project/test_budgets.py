@@ -53,10 +53,10 @@ BUDGETS = {
 CEILINGS = {
     "lines of tpgmm_torch": 13860,
     "lines of tpgmm_datasets": 4775,
-    "lines of lerobot_policy_tpgmm": 2030,
+    "lines of lerobot_policy_tpgmm": 2045,
     "lines of tpgmm_tools": 2875,
-    "lines of environments and evaluation": 9400,
-    "lines of tests of core, data sets, policy and tools": 19660,
+    "lines of environments and evaluation": 10290,
+    "lines of tests of core, data sets, policy and tools": 19690,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,
 }

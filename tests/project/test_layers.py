@@ -76,6 +76,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),
+        ("so101",),
         ("record",),
     ),
     "tpgmm_evaluation": (

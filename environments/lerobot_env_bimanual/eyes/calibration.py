@@ -43,7 +43,12 @@ def chain_of(rig: Rig, link: str) -> NDArray[np.intp]:
     while body:
         chain.add(int(body))
         body = model.body_parentid[body]
-    return np.flatnonzero(np.isin(model.jnt_bodyid[: model.nu], list(chain)))
+    return np.flatnonzero(np.isin(model.jnt_bodyid[_driven(rig)], list(chain)))
+
+
+def _driven(rig: Rig) -> NDArray[np.intp]:
+    """The joints that have motors, among all."""
+    return np.asarray(rig.scene.model.actuator_trnid[:, 0], dtype=np.intp)
 
 
 def varied_postures(
@@ -74,7 +79,7 @@ def varied_postures(
     """
     scene, before = rig.scene, rig.scene.data.qpos.copy()
     moved, camera = chain_of(rig, link), camera or next(iter(rig.views))
-    low, high = scene.model.jnt_range[moved].T
+    low, high = scene.model.jnt_range[_driven(rig)[moved]].T
     joints, kept, seen = scene.joints, list[Vector](), list[Array]()
     for shares in (1 + RANGE * rng.uniform(-1, 1, (DRAWN, len(moved)))) / 2:
         joints[moved] = low + shares * (high - low)
@@ -114,8 +119,9 @@ def varied_postures(
 
 def _place(rig: Rig, joints: Vector) -> None:
     """Put the joints somewhere."""
-    rig.scene.data.qpos[: len(joints)] = joints
-    mujoco.mj_kinematics(rig.scene.model, rig.scene.data)
+    model, data = rig.scene.model, rig.scene.data
+    data.qpos[model.jnt_qposadr[_driven(rig)]] = joints
+    mujoco.mj_kinematics(model, data)
 
 
 def _faces(rig: Rig, pose: Array, link: str) -> bool:

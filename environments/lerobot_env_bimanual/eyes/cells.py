@@ -31,7 +31,7 @@ def cell_of(env: Any) -> dict[str, Any]:
     env = env.unwrapped
     if env.eyes is None:
         raise DataError("the environment has no cameras: make it with cameras='front'")
-    return {**env.eyes.content(), "joints": list(env.joint_names)}
+    return {**env.eyes.content(), **env.cell_of_joints()}
 
 
 def perturbed(

@@ -56,7 +56,7 @@ def recording(
     objects : sequence of str, default=()
         Whose poses are recorded too, in ``observation.environment_state``.
     units : sequence of str, optional
-        Of the joints; radians by default.
+        Of the joints; radians by default. Empty to declare none, as LeRobot does.
     robot_type : str, optional
     codec : {"av1", "h264", "pictures"}, default="av1"
 
@@ -88,7 +88,8 @@ def recording(
         raise DataError(f"a codec is one of {list(CODECS)}, got {codec!r}")
     names, video = list(joint_names), CODECS[codec]
     joints: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
-    joints |= {"info": {"units": list(units or ["rad"] * len(names))}}
+    units = ["rad"] * len(names) if units is None else list(units)
+    joints |= {"info": {"units": units}} if units else {}
     features: dict[str, Any] = {OBS_STATE: joints, ACTION: joints}
     for name, (width, height) in cameras.items():
         shape, axes = (height, width, 3), ["height", "width", "channels"]

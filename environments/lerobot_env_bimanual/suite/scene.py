@@ -135,7 +135,7 @@ class SuiteScene(RobotScene):
         mujoco.mj_resetData(self.model, self.data)
         self.data.eq_active[:] = False
         self.held, self.taken = set(), set()
-        self.data.ctrl[:] = self.data.qpos[: self._n] = joints
+        self.data.ctrl[:] = self.data.qpos[self._places] = joints
         self.model.body_pos[self.model.body("table").id, 2] = table
         for name, pose in poses.items():
             self.put(name, pose)
@@ -143,7 +143,7 @@ class SuiteScene(RobotScene):
 
     def place(self, joints: NDArray[np.float64], seconds: float) -> None:
         """Put the joints somewhere without dynamics; objects stay where they are."""
-        self.data.qpos[: self._n] = joints
+        self.data.qpos[self._places] = joints
         mujoco.mj_kinematics(self.model, self.data)
         self.data.time += seconds
 

@@ -10,8 +10,11 @@ from lerobot_env_bimanual.eyes.calibration import chain_of, varied_postures
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.eyes.rig import looking
 from lerobot_env_bimanual.eyes.views import View
+from lerobot_env_bimanual.rendering import offscreen
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import TagDetector
+
+pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
 TAGS = {"r_hand": cube_at(40, y=0.04)}
 

@@ -20,11 +20,14 @@ from lerobot_env_bimanual.eyes.cells import cell_of, perturbed
 from lerobot_env_bimanual.eyes.lens import usual_camera
 from lerobot_env_bimanual.eyes.rig import Rig, View, looking
 from lerobot_env_bimanual.eyes.views import CENTRE, VIEWS, around, chosen_views
+from lerobot_env_bimanual.rendering import offscreen
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_vision.cell import cell_from
 from tpgmm_vision.detection.tags import TagDetector
 from tpgmm_vision.poses import angle_between, inverse, transformed
+
+pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
 TASKS = {
     "bottle_shaking": BottleShakingEnv,
