@@ -189,7 +189,9 @@ class Cell:
         if not self.cameras:
             raise DataError("the cell has no cameras: tpgmm calibrate camera adds one")
         if missing := [name for name, one in self.cameras.items() if one.pose is None]:
-            raise DataError(f"cameras {missing} of the cell have no pose: tpgmm calibrate cell")
+            raise DataError(
+                f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
+            )
         return dict(self.cameras)
 
 
