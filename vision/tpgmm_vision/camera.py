@@ -14,6 +14,9 @@ from tpgmm_vision.poses import Array
 
 __all__ = ["Camera"]
 
+#: Undistortion ends after so many steps, or where a ray moves less.
+ENDS = cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-10
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -51,10 +54,7 @@ class Camera:
                 raise DataError(f"{name} of a camera is {n} finite numbers, got {values}")
             object.__setattr__(self, name, tuple(values.tolist()))
         if min(self.width, self.height) < 1 or min(self.focal_length) <= 0:
-            raise DataError(
-                f"a camera has a width, a height and a focal length above 0, got {self.width}, "
-                f"{self.height}, {self.focal_length}"
-            )
+            raise DataError(f"a camera has sizes and focal lengths above 0, got {self}")
 
     @property
     def matrix(self) -> Array:
@@ -77,10 +77,8 @@ class Camera:
     def rays(self, pixels: ArrayLike) -> Array:
         """Where the rays of pixels (n, 2) meet the plane z = 1: x and y (n, 2)."""
         points = np.asarray(pixels, dtype=float).reshape(-1, 1, 2)
-        found = cv2.undistortPointsIter(
-            points, self.matrix, np.array(self.distortion), None, None,
-            (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-10),
-        )  # fmt: skip
+        lens = self.matrix, np.array(self.distortion)
+        found = cv2.undistortPointsIter(points, *lens, None, None, ENDS)
         return np.asarray(found.reshape(-1, 2), dtype=float)
 
     def check(self, picture: Any, name: str) -> None:
@@ -92,7 +90,6 @@ class Camera:
         """
         if picture.shape[:2] != (self.height, self.width):
             raise DataError(
-                f"camera {name!r} was calibrated for {self.width} x {self.height} pixels, "
-                f"got {picture.shape[1]} x {picture.shape[0]}: calibrate it again at this "
-                "size, or set the camera to the other"
+                f"camera {name!r} was calibrated for {self.width} x {self.height} pixels, got "
+                f"{picture.shape[1]} x {picture.shape[0]}: calibrate it again, or change it"
             )

@@ -29,22 +29,25 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tpgmm_torch.atomic import read_whole, replacing
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.data.pose_names import is_gripper
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, angle_between, pose_matrix, pose_vector
+from tpgmm_vision.poses import Array, angle_between, inverse, pose_matrix, pose_vector
 from tpgmm_vision.targets import Target, target_from
 
 __all__ = [
-    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "cell_of", "read_cell",
-    "write_cell",
+    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "cell_of", "check_robot",
+    "read_cell", "write_cell",
 ]  # fmt: skip
 
 #: Poses that are nearer to each other are the same: [mm], [deg].
@@ -90,8 +93,8 @@ class CellObject:
         Of its origin in the base frame, while nobody holds it [m].
     """
 
-    target: Target
-    pose: Array
+    target: Target = field(default_factory=lambda: Target({}))
+    pose: Array = field(default_factory=lambda: np.eye(4))
     upright: bool = False
     height: float | None = None
 
@@ -142,19 +145,25 @@ class Cell:
         told = []
         for kind in ("cameras", "objects", "checks"):
             one, two = getattr(self, kind), getattr(other, kind)
-            told += [f"{name!r} of the {kind} is missing" for name in one.keys() - two]
-            told += [f"{name!r} of the {kind} is new" for name in two.keys() - one]
-            for name in sorted(one.keys() & two):
+            for name in sorted(one.keys() | two):
+                what = f"{name!r} of the {kind}"
+                if name not in one or name not in two:
+                    told.append(f"{what} is {'missing' if name in one else 'new'}")
+                    continue
                 before, after = (cell.content[kind][name] for cell in (self, other))
                 keys = sorted({*before, *after} - {"pose", "report"})
-                changed = [key for key in keys if before.get(key) != after.get(key)]
-                if changed:
-                    told.append(f"{name!r} of the {kind} has another {' and '.join(changed)}")
-                told += _moved(f"{name!r} of the {kind}", one[name].pose, two[name].pose)
-        shifts = self.shifts(other).items()
+                if changed := [key for key in keys if before.get(key) != after.get(key)]:
+                    told.append(f"{what} has another {' and '.join(changed)}")
+                if one[name].pose is None or two[name].pose is None:
+                    continue
+                step = inverse(one[name].pose) @ two[name].pose
+                moved = 1e3 * float(np.linalg.norm(step[:3, 3]))
+                turned = math.degrees(angle_between(np.eye(4), step))
+                if moved > SAME_PLACE or turned > SAME_ANGLE:
+                    told.append(f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg")
         return told + [
             f"joint {name!r} is offset by {math.degrees(shift):+.2f} deg more"
-            for name, shift in shifts
+            for name, shift in self.shifts(other).items()
         ]
 
     def shifts(self, other: Cell) -> dict[str, float]:
@@ -177,25 +186,41 @@ class Cell:
         DataError
             If one has none, or there are none.
         """
-        missing = [name for name, one in self.cameras.items() if one.pose is None]
-        if missing or not self.cameras:
+        if not self.cameras:
+            raise DataError("the cell has no cameras: tpgmm calibrate camera adds one")
+        if missing := [name for name, one in self.cameras.items() if one.pose is None]:
             raise DataError(
                 f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
-                if missing
-                else "the cell has no cameras: tpgmm calibrate camera adds one"
             )
         return dict(self.cameras)
 
 
-def _moved(what: str, before: Array | None, after: Array | None) -> list[str]:
-    """How far something is from where it was, if it is."""
-    if before is None or after is None:
-        return []
-    moved = 1e3 * float(np.linalg.norm(before[:3, 3] - after[:3, 3]))
-    turned = math.degrees(angle_between(before, after))
-    if moved < SAME_PLACE and turned < SAME_ANGLE:
-        return []
-    return [f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg"]
+def check_robot(cell: Cell, robot: Any) -> None:
+    """Refuse a cell of another robot.
+
+    Its joints are all among the robot's, or all of the robot's among them; grippers, which move
+    no hand, do not count.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+    """
+    if robot is None:
+        if cell.links:
+            raise DataError(f"cameras of the cell are on links {cell.links}: give the robot")
+        return
+    ours, theirs = (
+        {name for name in joints if not is_gripper(name)}
+        for joints in (robot.joint_names, cell.joints)
+    )
+    if not (ours <= theirs or theirs <= ours):
+        raise DataError(
+            f"the cell is that of another robot, with the joints {list(cell.joints)}, this one "
+            f"has {list(robot.joint_names)}: make its own by tpgmm calibrate cell"
+        )
+    for link in cell.links:
+        if link not in robot.links:
+            raise UnknownNameError("link", link, "the robot", robot.links)
 
 
 def cell_of(given: Mapping[str, Any] | str | Path) -> Cell:
@@ -241,20 +266,11 @@ def write_cell(content: Mapping[str, Any], path: str | Path) -> Cell:
 
 def _formatted(content: Mapping[str, Any]) -> str:
     """JSON in which lists of numbers take one line each."""
-    lists: list[str] = []
 
-    def short(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: short(one) for key, one in value.items()}
-        if isinstance(value, list | tuple | np.ndarray):
-            lists.append(json.dumps(np.asarray(value).tolist()))
-            return f"\0{len(lists) - 1}\0"
-        return value
+    def one_line(found: re.Match[str]) -> str:
+        return re.sub(r"\n *", "", found[0].replace(",\n", ", \n"))
 
-    text = json.dumps(short(content), indent=2)
-    for number, one in enumerate(lists):
-        text = text.replace(f'"\\u0000{number}\\u0000"', one)
-    return text + "\n"
+    return re.sub(r"\[[^][{}]*\]", one_line, json.dumps(content, indent=2)) + "\n"
 
 
 def cell_from(content: Any, where: str = "the cell") -> Cell:
@@ -265,29 +281,13 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
     DataError
         If it is no cell; the message begins with ``where`` and names the entry.
     """
-    parts: dict[str, Callable[[_Entry], Any]] = {
-        "cameras": _camera,
-        "objects": _object,
-        "checks": _check,
-        "joint_offsets": lambda entry: entry.number(),
-    }
-    root = _Entry(content, where)
-    root.allow(*parts, "joints", "source")
-    made: dict[str, Any] = {
-        part: {name: make(one) for name, one in root.items(part)}
-        for part, make in parts.items()
-    }
-    joints, source = root.get("joints"), root.get("source")
-    cell = Cell(
-        **made,
-        joints=() if joints is None else joints.texts(),
-        source="tags" if source is None else source.text(),
-        content=content,
-    )
-    if joints is not None and (extra := cell.joint_offsets.keys() - set(cell.joints)):
-        raise DataError(
-            f"{where}: joint_offsets of {sorted(extra)}, which are not among joints"
-        )
+    made = _entries(content, where, {}, {
+        "cameras": _named(_camera), "objects": _named(_object), "checks": _named(_check),
+        "joint_offsets": _named(_numbers(1)), "joints": _texts, "source": _text,
+    })  # fmt: skip
+    cell = Cell(**made, content=content)
+    if "joints" in made and (extra := cell.joint_offsets.keys() - set(cell.joints)):
+        raise DataError(f"{where}: joint_offsets of {sorted(extra)}, not among the joints")
     _check_unique(cell, where)
     return cell
 
@@ -297,9 +297,8 @@ def _check_unique(cell: Cell, where: str) -> None:
     for name, thing in cell.objects.items():
         if cell.source == "tags" and not thing.target.corners:
             raise DataError(f"{where}: objects: {name} needs 'target', the tags on it")
-    targets: list[tuple[str, CellObject | CellCheck]] = list(cell.objects.items())
-    targets += cell.checks.items()
     owners: dict[tuple[str, int], str] = {}
+    targets: Iterable[tuple[str, Any]] = chain(cell.objects.items(), cell.checks.items())
     for name, one in targets:
         for number in one.target.corners:
             other = owners.setdefault((one.target.family, number), name)
@@ -312,124 +311,103 @@ def _check_unique(cell: Cell, where: str) -> None:
         raise DataError(f"{where}: cameras share a key, got {keys}")
 
 
-@dataclass
-class _Entry:
-    """A value of the file, and where it is."""
+# Readers of entries: functions of a value of the file, and of where it is for errors.
+_Reader = Callable[[Any, str], Any]
 
-    value: Any
-    where: str
 
-    def allow(self, *names: str) -> None:
-        """Refuse what is no object, and other names."""
-        if not isinstance(self.value, Mapping):
-            raise DataError(f"{self.where} is an object with {list(names)}, got {self.value!r}")
-        if extra := [name for name in self.value if name not in names]:
-            raise DataError(f"{self.where} has no entries {extra}; there are {list(names)}")
+def _entries(
+    value: Any, where: str, needed: Mapping[str, _Reader], other: Mapping[str, _Reader]
+) -> dict[str, Any]:
+    """The entries of an object, as their readers make them."""
+    readers = {**needed, **other}
+    if not isinstance(value, Mapping):
+        raise DataError(f"{where} is an object with {list(readers)}, got {value!r}")
+    if extra := [name for name in value if name not in readers]:
+        raise DataError(f"{where} has no entries {extra}; there are {list(readers)}")
+    there = [name for name in readers if value.get(name) is not None]
+    if missing := [name for name in needed if name not in there]:
+        raise DataError(f"{where} needs {missing[0]!r}; it has {list(value)}")
+    return {name: readers[name](value[name], f"{where}: {name}") for name in there}
 
-    def get(self, name: str) -> _Entry | None:
-        """An entry of it, if there is one."""
-        value = self.value.get(name)
-        return None if value is None else _Entry(value, f"{self.where}: {name}")
 
-    def need(self, name: str) -> _Entry:
-        """An entry of it that must be there."""
-        if (found := self.get(name)) is None:
-            raise DataError(f"{self.where} needs {name!r}; it has {list(self.value)}")
-        return found
+def _named(reader: _Reader) -> _Reader:
+    """A reader of an object of named entries."""
 
-    def items(self, name: str) -> list[tuple[str, _Entry]]:
-        """The entries of an object in it; none where it is missing."""
-        if (found := self.get(name)) is None:
-            return []
-        if not isinstance(found.value, Mapping):
-            raise DataError(f"{found.where} is an object of named entries, got {found.value!r}")
-        return [(key, _Entry(one, f"{found.where}: {key}")) for key, one in found.value.items()]
+    def read(value: Any, where: str) -> dict[str, Any]:
+        if not isinstance(value, Mapping):
+            raise DataError(f"{where} is an object of named entries, got {value!r}")
+        return {name: reader(one, f"{where}: {name}") for name, one in value.items()}
 
-    def numbers(self, n: int) -> list[float]:
-        """A list of ``n`` finite numbers."""
-        values = self.value if isinstance(self.value, list | tuple) else [self.value]
+    return read
+
+
+def _numbers(n: int) -> _Reader:
+    """A reader of ``n`` finite numbers."""
+
+    def read(value: Any, where: str) -> Any:
+        values = value if isinstance(value, list | tuple) else [value]
         plain = all(type(one) in (int, float) for one in values)
         if not plain or len(values) != n or not all(map(math.isfinite, values)):
             wanted = f"{n} finite numbers" if n > 1 else "a finite number"
-            raise DataError(f"{self.where} is {wanted}, got {self.value!r}")
-        return [float(one) for one in values]
+            raise DataError(f"{where} is {wanted}, got {value!r}")
+        return tuple(map(float, values)) if n > 1 else float(values[0])
 
-    def number(self) -> float:
-        """A finite number."""
-        return self.numbers(1)[0]
-
-    def text(self) -> str:
-        """A text that is not empty."""
-        if not isinstance(self.value, str) or not self.value:
-            raise DataError(f"{self.where} is a text, got {self.value!r}")
-        return self.value
-
-    def texts(self) -> tuple[str, ...]:
-        """Texts that are not empty."""
-        if not isinstance(self.value, list | tuple):
-            raise DataError(f"{self.where} is a list of texts, got {self.value!r}")
-        return tuple(_Entry(one, self.where).text() for one in self.value)
-
-    def flag(self) -> bool:
-        """True or false."""
-        if not isinstance(self.value, bool):
-            raise DataError(f"{self.where} is true or false, got {self.value!r}")
-        return self.value
-
-    def pose(self) -> Array:
-        """A pose (4, 4)."""
-        values = self.numbers(7)
-        try:
-            return pose_matrix(values)
-        except DataError as error:
-            raise DataError(f"{self.where}: {error}") from error
+    return read
 
 
-def _camera(entry: _Entry) -> CellCamera:
-    numbers = {"size": 2, "focal_length": 2, "principal_point": 2}
-    entry.allow("key", *numbers, "distortion", "pose", "link", "report")
-    size, focal_length, principal_point = (
-        entry.need(name).numbers(n) for name, n in numbers.items()
-    )
-    distortion = entry.get("distortion")
-    lens = distortion.numbers(5) if distortion else [0.0] * 5
+def _plain(kind: Any, wanted: str) -> _Reader:
+    """A reader of a value of a type that is not empty."""
+
+    def read(value: Any, where: str) -> Any:
+        if not isinstance(value, kind) or value == "":
+            raise DataError(f"{where} is {wanted}, got {value!r}")
+        return value
+
+    return read
+
+
+_text, _flag = _plain(str, "a text"), _plain(bool, "true or false")
+
+
+def _texts(value: Any, where: str) -> tuple[str, ...]:
+    given = _plain(list | tuple, "a list of texts")(value, where)
+    return tuple(_text(one, where) for one in given)
+
+
+def _pose(value: Any, where: str) -> Array:
+    return _located(pose_matrix, where, _numbers(7)(value, where))
+
+
+def _located(make: Callable[..., Any], where: str, *given: Any, **options: Any) -> Any:
+    """What a function makes; its errors say where the entry is."""
     try:
-        camera = Camera(
-            int(size[0]), int(size[1]), (focal_length[0], focal_length[1]),
-            (principal_point[0], principal_point[1]), tuple(lens),
-        )  # fmt: skip
+        return make(*given, **options)
     except DataError as error:
-        raise DataError(f"{entry.where}: {error}") from error
-    pose, link = entry.get("pose"), entry.get("link")
-    return CellCamera(
-        camera,
-        entry.need("key").text(),
-        None if pose is None else pose.pose(),
-        None if link is None else link.text(),
-    )
+        raise DataError(f"{where}: {error}") from error
 
 
-def _object(entry: _Entry) -> CellObject:
-    entry.allow("target", "pose", "upright", "height")
-    target, pose, upright, height = map(entry.get, ("target", "pose", "upright", "height"))
-    return CellObject(
-        Target({}) if target is None else _target(target),
-        np.eye(4) if pose is None else pose.pose(),
-        upright is not None and upright.flag(),
-        None if height is None else height.number(),
-    )
+def _target(value: Any, where: str) -> Target:
+    wanted = 'an object such as {"tag": 3, "size": 0.06}'
+    return target_from(_plain(Mapping, wanted)(value, where), where)
 
 
-def _check(entry: _Entry) -> CellCheck:
-    entry.allow("target", "pose")
-    return CellCheck(_target(entry.need("target")), entry.need("pose").pose())
+def _camera(value: Any, where: str) -> CellCamera:
+    numbers = {"size": 2, "focal_length": 2, "principal_point": 2}
+    needed = {"key": _text, **{name: _numbers(n) for name, n in numbers.items()}}
+    other = {"distortion": _numbers(5), "pose": _pose, "link": _text, "report": _text}
+    lens = _entries(value, where, needed, other)
+    size, mount = lens.pop("size"), {n: lens.pop(n, None) for n in ("key", "pose", "link")}
+    lens.pop("report", None)
+    return CellCamera(_located(Camera, where, *map(int, size), **lens), **mount)
 
 
-def _target(entry: _Entry) -> Target:
-    if not isinstance(entry.value, Mapping):
-        wanted = 'an object such as {"tag": 3, "size": 0.06}'
-        raise DataError(f"{entry.where} is {wanted}, got {entry.value!r}")
-    return target_from(entry.value, entry.where)
+def _object(value: Any, where: str) -> CellObject:
+    other = {"target": _target, "pose": _pose, "upright": _flag, "height": _numbers(1)}
+    return CellObject(**_entries(value, where, {}, other))
+
+
+def _check(value: Any, where: str) -> CellCheck:
+    return CellCheck(**_entries(value, where, {"target": _target, "pose": _pose}, {}))
 
 
 def camera_content(camera: Camera, key: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from matplotlib.path import Path as Outline
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array
-from tpgmm_vision.targets import DEFAULT_FAMILY, FAMILIES, Board, modules_of, target_from
+from tpgmm_vision.targets import DEFAULT_FAMILY, Board, dictionary_of, modules_of, target_from
 
 __all__ = ["PAGES", "print_targets"]
 
@@ -158,12 +158,12 @@ def _cube(entry: Mapping[str, Any], page: str) -> Any:
 def _board(board: Board, page: str) -> Any:
     """A board."""
     square, marker, drawn = board.square * 1e3, board.marker * 1e3, board.drawn
-    columns, rows = board.columns, board.rows
+    columns, rows = drawn.getChessboardSize()
     words = (
         f"{columns} x {rows} squares of {square:g} mm, {board.family} of {marker:g} mm. {GLUE}"
     )
-    what = "a board with squares"
-    axes, free = _axes(page, words, what, square, square, (columns, 0), (rows, 0))
+    extent = (columns, 0), (rows, 0)
+    axes, free = _axes(page, words, "a board with squares", square, square, *extent)
     corner = np.array([(free[0] - columns * square) / 2, 0])
     markers = np.array(drawn.getObjPoints())[:, :, :2] * (1e3, -1e3)  # whose y is down
     for number, one in zip(drawn.getIds().ravel(), markers, strict=True):
@@ -200,17 +200,18 @@ def _axes(
     DataError
         If it fits on neither; the message says which size would.
     """
-    most = 0.0
-    for width, height in (PAGES[page], PAGES[page][::-1]):
-        free = width - 2 * MARGIN, height - 2 * MARGIN - FOOTER
-        fits = min((a - more) / n for a, (n, more) in zip(free, extent, strict=True))
-        if edge <= fits:
-            break
-        most = max(most, np.floor(fits * size / edge))
-    else:
+    sheets = PAGES[page], PAGES[page][::-1]
+    frees = [(width - 2 * MARGIN, height - 2 * MARGIN - FOOTER) for width, height in sheets]
+    fits = [
+        min((a - more) / n for a, (n, more) in zip(free, extent, strict=True)) for free in frees
+    ]
+    if edge > max(fits):
+        most = f"{np.floor(max(fits) * size / edge):g} mm would"
         raise DataError(
-            f"{what} of {size:g} mm does not fit on a page {page!r}, {most:g} mm would: {UNITS}"
+            f"{what} of {size:g} mm does not fit on a page {page!r}, {most}: {UNITS}"
         )
+    turned = edge > fits[0]
+    (width, height), free = sheets[turned], frees[turned]
     axes = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH)).add_axes((0, 0, 1, 1))
     axes.axis((-MARGIN, width - MARGIN, MARGIN - height, MARGIN))
     axes.axis("off")
@@ -239,8 +240,8 @@ def _fill(axes: Any, squares: Array, size: float) -> None:
 
 def _tag(axes: Any, family: str, number: int, corner: Array, size: float) -> None:
     """A tag's black modules; ``corner`` is the lower left one of its black square."""
-    count, dictionary = modules_of(family), cv2.aruco.getPredefinedDictionary(FAMILIES[family])
-    picture = cv2.aruco.generateImageMarker(dictionary, number, count)
+    count = modules_of(family)
+    picture = cv2.aruco.generateImageMarker(dictionary_of(family), number, count)
     _fill(axes, corner + np.argwhere(picture[::-1] == 0)[:, ::-1] * size / count, size / count)
 
 

@@ -16,7 +16,17 @@ import numpy as np
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array, pose_matrix, transformed
 
-__all__ = ["FAMILIES", "Board", "Target", "bundle", "cube", "modules_of", "tag", "target_from"]
+__all__ = [
+    "FAMILIES",
+    "Board",
+    "Target",
+    "bundle",
+    "cube",
+    "dictionary_of",
+    "modules_of",
+    "tag",
+    "target_from",
+]
 
 #: Families of tags that OpenCV decodes, by name.
 FAMILIES: dict[str, int] = {
@@ -36,9 +46,24 @@ FACES = (
 )  # fmt: skip
 
 
+def dictionary_of(family: str) -> Any:
+    """OpenCV's dictionary of a family.
+
+    Raises
+    ------
+    DataError
+        If it is not known.
+    """
+    if family not in FAMILIES:
+        raise DataError(
+            f"tags of the family {family!r} are not known; there are {list(FAMILIES)}"
+        )
+    return cv2.aruco.getPredefinedDictionary(FAMILIES[family])
+
+
 def modules_of(family: str) -> int:
     """Modules on a side of a tag's black square."""
-    return int(cv2.aruco.getPredefinedDictionary(FAMILIES[family]).markerSize) + 2
+    return int(dictionary_of(family).markerSize) + 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +83,8 @@ class Target:
     family: str = DEFAULT_FAMILY
 
     def __post_init__(self) -> None:
-        if self.family not in FAMILIES:
-            raise DataError(f"tags of the family {self.family!r} are not known; there are "
-                            f"{list(FAMILIES)}")  # fmt: skip
-        count = len(cv2.aruco.getPredefinedDictionary(FAMILIES[self.family]).bytesList)
-        wrong = [number for number in self.corners if not 0 <= number < count]
-        if wrong:
+        count = len(dictionary_of(self.family).bytesList)
+        if any(not 0 <= number < count for number in self.corners):
             raise DataError(
                 f"a target has tags 0 to {count - 1} of {self.family}, got {list(self.corners)}"
             )
@@ -77,11 +98,8 @@ class Target:
 def _square(size: float) -> Array:
     """Corners of a tag in its own frame."""
     if not 0 < size < 10:
-        raise DataError(
-            f"the size of a tag is the edge of its black square in metres, got {size}"
-        )
-    half = size / 2
-    return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+        raise DataError(f"the size of a tag is its black square's edge in metres, got {size}")
+    return size / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
 
 
 def tag(number: int, size: float, family: str = DEFAULT_FAMILY) -> Target:
@@ -118,7 +136,7 @@ def cube(
     """
     if not 1 <= len(numbers) <= len(FACES) or len(set(numbers)) < len(numbers):
         raise DataError(f"a cube has one to six different tags, got {list(numbers)}")
-    modules = modules_of(family) if family in FAMILIES else 1
+    modules = modules_of(family)
     side = size * (modules + 2) / modules if side is None else side
     if side < size:
         raise DataError(f"tags of {size} m do not fit on a cube of {side} m")
@@ -144,11 +162,8 @@ def bundle(
     """
     if not poses:
         raise DataError("a bundle has at least one tag, got none")
-    corners = {
-        int(number): transformed(pose_matrix(pose), _square(size))
-        for number, pose in poses.items()
-    }
-    return Target(corners, family)
+    places = {int(number): pose_matrix(pose) for number, pose in poses.items()}
+    return Target({n: transformed(pose, _square(size)) for n, pose in places.items()}, family)
 
 
 @dataclass(frozen=True)
@@ -173,19 +188,13 @@ class Board:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.marker < self.square:
-            raise DataError(
-                "a board has at least 3 x 3 squares, and tags smaller than these, got "
-                f"{self.columns} x {self.rows}, {self.marker} m in {self.square} m"
-            )
-        if self.family not in FAMILIES:
-            raise DataError(f"tags of the family {self.family!r} are not known; there are "
-                            f"{list(FAMILIES)}")  # fmt: skip
+            raise DataError(f"a board has 3 x 3 squares and more, larger than tags, got {self}")
+        dictionary_of(self.family)
 
     @property
     def drawn(self) -> Any:
         """OpenCV's board."""
-        dictionary = cv2.aruco.getPredefinedDictionary(FAMILIES[self.family])
-        size = self.columns, self.rows
+        size, dictionary = (self.columns, self.rows), dictionary_of(self.family)
         return cv2.aruco.CharucoBoard(size, self.square, self.marker, dictionary)
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.cell import Cell
+from tpgmm_vision.cell import Cell, check_robot
 from tpgmm_vision.poses import Array, mean_pose, pose_matrix, pose_vector
 from tpgmm_vision.sources import ObservedPose, pose_source
 
@@ -59,15 +57,7 @@ class Watch:
                 f"the cell has the objects {list(cell.objects)}, not {missing}: add them to "
                 "its file, or take poses that are observed otherwise (--policy.cell=none)"
             )
-        ours, theirs = (
-            {name for name in joints if not is_gripper(name)}
-            for joints in (robot.joint_names, cell.joints)
-        )
-        if not (ours <= theirs or theirs <= ours):
-            raise DataError(
-                f"the cell is that of a robot with the joints {list(cell.joints)}, this one "
-                f"has {list(robot.joint_names)}: it needs another cell, tpgmm calibrate cell"
-            )
+        check_robot(cell, robot)
         cell.placed()
         self.cell, self.names = cell, tuple(names)
         self._robot, self.sources = robot, [pose_source(cell, robot)]
@@ -81,8 +71,8 @@ class Watch:
         self._seen: list[dict[str, ObservedPose]] = []
         self._times: Array = np.zeros(1)
         self._real = math.nan
-        self._unseen: dict[tuple[int, str], float] = {}
-        self._recent: dict[tuple[int, str], deque[Array | None]] = {}
+        self._unseen: Array = np.zeros((1, len(self.names)))
+        self._recent: deque[Array] = deque(maxlen=RECENT)
 
     def look(
         self,
@@ -115,22 +105,24 @@ class Watch:
         if passed is None:
             passed = float(np.nan_to_num(real - self._real))
         now = np.broadcast_to(before + passed if times is None else times, len(rows))
-        elapsed = now - before if self._seen else np.zeros(len(rows))
-        self._real, self._times, self._seen = real, now, []
-        while len(self.sources) < len(rows):
-            self.sources.append(pose_source(self.cell, self._robot))
+        elapsed = (now - before if self._seen else np.zeros(len(rows))).clip(0)
+        self._real, self._times, self._seen, self.problems = real, now, [], []
+        poses = np.full((len(rows), len(self.names), 7), np.nan)
         for row in rows:
+            if row == len(self.sources):
+                self.sources.append(pose_source(self.cell, self._robot))
+            source = self.sources[row]
             known = dict(zip(self._robot.joint_names, joints[row].tolist(), strict=True))
             here = {key: stack[row] for key, stack in pictures.items()}
-            self._seen.append(self.sources[row].poses(here, known, float(now[row])))
-        self.problems = [getattr(self.sources[row], "problem", "") for row in rows]
-        for row, name in product(rows, self.names):
-            pose, at = self._pose(row, name), (row, name)
-            recent = self._recent.setdefault(at, deque(maxlen=RECENT))
-            recent.append(None if pose is None else pose_matrix(pose))
-            self._unseen[at] = self._unseen.get(at, 0.0) + max(float(elapsed[row]), 0.0)
-            if pose is not None:
-                self._unseen[at] = 0.0
+            self._seen.append(source.poses(here, known, float(now[row])))
+            self.problems.append(getattr(source, "problem", ""))
+            for k, name in enumerate(self.names):
+                one = self._seen[row].get(name)
+                if one is not None and one.valid and not self.problems[row]:
+                    poses[row, k] = one.pose
+        poses[~np.isfinite(poses).all(-1)] = np.nan
+        self._unseen = np.isnan(poses[..., 0]) * (self._unseen + elapsed[:, None])
+        self._recent.append(poses)
 
     def _pictures(self, name: str, images: Mapping[str, Any]) -> NDArray[np.uint8]:
         """Pictures (B, height, width, 3) of a camera."""
@@ -152,16 +144,9 @@ class Watch:
         camera.camera.check(stack[0], name)
         return stack
 
-    def _pose(self, row: int, name: str) -> Array | None:
-        """The pose (7,) of an object that is seen now; None if it is not."""
-        seen = self._seen[row].get(name)
-        if seen is None or self.problems[row] or not seen.valid:
-            return None
-        return seen.pose if np.isfinite(seen.pose).all() else None
-
     def poses(self) -> dict[str, Array]:
         """Where the objects are seen now (B, 7), NaN where they are not."""
-        return self._stacked(self._pose)
+        return {name: self._recent[-1][:, k] for k, name in enumerate(self.names)}
 
     def first(self) -> dict[str, Array]:
         """Where the objects are at the start (B, 7), NaN where they were not seen often yet.
@@ -171,35 +156,30 @@ class Watch:
         DataError
             If one is not seen for too long.
         """
-        if not any(self.problems) and max(self._unseen.values(), default=0.0) > SEARCH_TIME:
+        if not any(self.problems) and self._unseen.max(initial=0.0) > SEARCH_TIME:
             raise DataError(
                 f"{'; '.join(self.missing())}, for {SEARCH_TIME:g} s before the start: bring "
                 f"it into view of {list(self.cell.cameras)}"
             )
-        return self._stacked(self._mean)
-
-    def _mean(self, row: int, name: str) -> Array | None:
-        """The mean of the last poses, where they are enough."""
-        recent = [one for one in self._recent[row, name] if one is not None]
-        return pose_vector(mean_pose(recent)[0]) if len(recent) >= FIRST else None
-
-    def _stacked(self, pose: Callable[[int, str], Array | None]) -> dict[str, Array]:
-        """Poses (B, 7) of the objects."""
-        lost = np.full(7, np.nan)
-        found = {
-            name: [pose(row, name) for row in range(len(self._seen))] for name in self.names
-        }
         return {
-            name: np.array([lost if one is None else one for one in poses])
-            for name, poses in found.items()
+            name: np.stack([self._mean(row, k) for row in range(len(self._seen))])
+            for k, name in enumerate(self.names)
         }
+
+    def _mean(self, row: int, k: int) -> Array:
+        """The mean (7,) of the last poses of an object, where they are enough."""
+        recent = [one[row, k] for one in self._recent if np.isfinite(one[row, k, 0])]
+        if len(recent) < FIRST:
+            return np.full(7, np.nan)
+        return pose_vector(mean_pose(pose_matrix(recent))[0])
 
     def missing(self) -> list[str]:
         """What an episode cannot begin for, in words."""
         return list(self.ages()) or [
             f"robot {row} does not see {self._why(row, name)}"
-            for row, name in self._recent
-            if self._mean(row, name) is None
+            for row in range(len(self._seen))
+            for k, name in enumerate(self.names)
+            if np.isnan(self._mean(row, k)[0])
         ]
 
     def ages(self) -> dict[str, Any]:
@@ -221,10 +201,9 @@ class Watch:
         """
         if problem := self.problems[row]:
             return {problem: ""}
-        ages = {name: self._unseen.get((row, name), 0.0) for name in self.names}
         return {
             name: f"{self._why(row, name)} is not seen for {age:.2g} s"
-            for name, age in ages.items()
+            for name, age in zip(self.names, self._unseen[row], strict=True)
             if age >= UNSEEN_TIME
         }
 

@@ -145,7 +145,7 @@ def test_what_does_not_go_together_is_refused():
     cell = so101_cell(1.0, rng)
     joints, seen = cell.recorded(10, rng)
     twice = {"front": [*seen["front"][:-1], Detections(twice=frozenset([12]))]}
-    with pytest.raises(DataError, match=r"sees tags \[12\] twice in picture 9"):
+    with pytest.raises(DataError, match=r"sees tags twice, by picture \{9: \[12\]\}"):
         calibrated(cell, rng, (joints, twice))
     with pytest.raises(UnknownNameError, match="'side'"):
         calibrated(cell, rng, (joints, {"side": seen["front"]}))

@@ -107,4 +107,4 @@ def test_a_camera_is_calibrated_by_a_folder_of_pictures(written, tmp_path):
     assert found.cameras["wrist"].link == HAND
     assert list(found.objects) == ["cup"]
     done = run("camera", tmp_path / "none.mp4", "--name", "wrist", "--cell", written)
-    assert "no folder, video or data set" in str(done.exception)
+    assert "none.mp4 is no folder of pictures and no video" in str(done.exception)

@@ -44,7 +44,8 @@ def root(original, tmp_path):
 def read(root, number=1, keys=(KEY,)):
     layout = open_layout(root)
     episode = layout.episodes[number]
-    return list(EpisodePictures(layout, keys).read(episode, np.arange(episode.length) / FPS))
+    time = np.arange(episode.length) / FPS
+    return [shown for _, shown in EpisodePictures(layout, keys).read(episode, time)]
 
 
 def test_each_row_has_its_own_picture(recorded):

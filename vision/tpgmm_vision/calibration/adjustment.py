@@ -6,17 +6,15 @@ The noise of the joints is integrated out to first order: corners of one posture
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, starmap
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from torch import Tensor
 
 from tpgmm_datasets.least_squares import levenberg_marquardt
-from tpgmm_vision.calibration.reprojection import Reprojection
+from tpgmm_vision.calibration.reprojection import Integers, Reprojection
 from tpgmm_vision.poses import Array
 
 __all__ = ["Adjustment", "Noise", "adjust"]
@@ -55,11 +53,9 @@ class Adjustment:
     misfit : ndarray of shape (N / 4,)
         Of each tag in each picture: mean square of its corners' deviations, in units of what
         noise explains.
-    left, jacobian : ndarray of shape (n,) and (n, n_free)
+    left, jacobian : ndarray of shape (n,) and (n, n_steps)
         Errors in units of their noise, 2 N of corners and those of offsets and scales from
-        what is known before, and how the free entries of a step lessen them.
-    surprise : float
-        Minus the logarithm of the likelihood, and of what is known before.
+        what is known before, and how steps lessen them.
     """
 
     problem: Reprojection
@@ -68,17 +64,41 @@ class Adjustment:
     misfit: Array
     left: Array
     jacobian: Array
-    surprise: float
 
     def covariance(self) -> Array:
         """Of the entries of a step (n_steps, n_steps), zero where they are not free."""
         free, found = self.problem.free, np.zeros((self.problem.n_steps,) * 2)
-        known = np.tile(1 / np.repeat(POSE_PRIOR, 3) ** 2, self.problem.n_poses)
-        weak = np.concatenate((known, np.zeros(len(free) - len(known))))[free]
-        found[np.ix_(free, free)] = np.linalg.inv(
-            self.jacobian.T @ self.jacobian + np.diag(weak)
+        weak = np.zeros(len(free))
+        weak[: self.problem.offsets.start] = np.tile(
+            np.repeat(POSE_PRIOR, 3) ** -2.0, self.problem.n_poses
         )
+        jacobian = self.jacobian[:, free]
+        normal = jacobian.T @ jacobian + np.diag(weak[free])
+        found[np.ix_(free, free)] = np.linalg.inv(normal)
         return found
+
+    def gain(self, columns: Array) -> tuple[float, Array, Array]:
+        """What another cause would explain, to first order and with the noise left by it.
+
+        Parameters
+        ----------
+        columns : ndarray of shape (n, k)
+            How steps of the cause lessen the errors.
+
+        Returns
+        -------
+        gain : float
+            By how much the logarithm of the likelihood rises.
+        step, spread : ndarray of shape (k,)
+            The likeliest step, and its standard deviations.
+        """
+        known, _ = np.linalg.qr(self.jacobian[:, self.problem.free])
+        columns = columns - known @ (known.T @ columns)
+        covariance = np.linalg.pinv(columns.T @ columns, hermitian=True)
+        share = columns.T @ self.left
+        explained = share @ covariance @ share / (self.left @ self.left)
+        gain = -len(self.left) / 2 * float(np.log1p(-explained))
+        return gain, covariance @ share, np.diag(covariance) ** 0.5
 
 
 def adjust(
@@ -103,7 +123,8 @@ def adjust(
 
         def residual(points: Tensor) -> tuple[Tensor, Tensor]:
             left, jacobian = _whitened(problem, points[0].numpy(), whitening)  # noqa: B023
-            return torch.as_tensor(left)[None], torch.as_tensor(jacobian)[None]
+            free = jacobian[:, problem.free]
+            return torch.as_tensor(left)[None], torch.as_tensor(free)[None]
 
         def retract(points: Tensor, step: Tensor) -> Tensor:
             whole = np.zeros(problem.n_steps)
@@ -120,7 +141,7 @@ def adjust(
             break
         last = surprise
     left, jacobian = _whitened(problem, state, _whitening(problem, state, found, weights))
-    return Adjustment(problem, state, found, misfit, left, jacobian, surprise)
+    return Adjustment(problem, state, found, misfit, left, jacobian)
 
 
 def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
@@ -129,22 +150,26 @@ def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
     return problem.corners.pixels - pixels, jacobian
 
 
+def _covariances(
+    problem: Reprojection, jacobian: Array, noise: Noise, weights: Array, starts: Integers
+) -> list[tuple[slice, Array]]:
+    """The covariances of errors of the corners from each of these to the next [pixels^2]."""
+    moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
+    variance = noise.pixels**2 / np.repeat(weights, 2)
+    blocks = starmap(slice, pairwise((2 * starts).tolist()))
+    return [(own, np.diag(variance[own]) + moved[own] @ moved[own].T) for own in blocks]
+
+
 def _whitening(
     problem: Reprojection, state: Array, noise: Noise, weights: Array
 ) -> list[tuple[slice, Array]]:
     """For the corners of each posture a matrix that makes their noise independent."""
     _, jacobian = _errors(problem, state)
-    moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
-    variance, made = noise.pixels**2 / np.repeat(weights, 2), []
-    for start, stop in pairwise(2 * _starts(problem)):
-        own = slice(start, stop)
-        covariance = np.diag(variance[own]) + moved[own] @ moved[own].T
-        root = np.linalg.cholesky(covariance)
-        made.append((own, solve_triangular(root, np.eye(len(root)), lower=True)))
-    return made
+    blocks = _covariances(problem, jacobian, noise, weights, _starts(problem))
+    return [(own, np.linalg.inv(np.linalg.cholesky(block))) for own, block in blocks]
 
 
-def _starts(problem: Reprojection) -> NDArray[np.int_]:
+def _starts(problem: Reprojection) -> Integers:
     """Where the corners of each posture begin, and their number."""
     postures = problem.corners.posture
     changes = np.flatnonzero(np.diff(postures)) + 1
@@ -154,7 +179,7 @@ def _starts(problem: Reprojection) -> NDArray[np.int_]:
 def _whitened(
     problem: Reprojection, state: Array, whitening: list[tuple[slice, Array]]
 ) -> tuple[Array, Array]:
-    """Errors in units of their noise, and how free entries of a step lessen them."""
+    """Errors in units of their noise, and how steps lessen them."""
     errors, jacobian = _errors(problem, state)
     table = np.column_stack((errors.ravel(), jacobian.reshape(errors.size, -1)))
     table = np.concatenate([root @ table[own] for own, root in whitening])
@@ -162,14 +187,13 @@ def _whitened(
     prior = np.zeros((len(known), problem.n_steps))
     prior[:, problem.offsets.start :] = np.diag(1 / priors)
     left = np.concatenate((table[:, 0], -known / priors))
-    return left, np.concatenate((table[:, 1:], prior))[:, problem.free]
+    return left, np.concatenate((table[:, 1:], prior))
 
 
 def _known(problem: Reprojection, state: Array) -> tuple[Array, Array]:
     """Offsets and scales, and their standard deviations before what is seen tells."""
-    _, offsets, scales = problem.split(state)
-    priors = np.full(len(offsets), OFFSET_PRIOR), np.full(len(scales), SCALE_PRIOR)
-    return np.concatenate((offsets, scales)), np.concatenate(priors)
+    counts = problem.robot.n_joints, len(problem.cameras) + 1
+    return state[16 * problem.n_poses :], np.repeat((OFFSET_PRIOR, SCALE_PRIOR), counts)
 
 
 def _noise(
@@ -177,28 +201,14 @@ def _noise(
 ) -> tuple[Noise, float]:
     """The likeliest noise, or what is given, and minus the logarithm of the likelihood."""
     errors, jacobian = _errors(problem, state)
-    by_joint = jacobian[..., problem.offsets].reshape(len(errors), 2, -1)
-    starts = _starts(problem)[:-1]
-    inner = np.einsum("ncj,nck,n->njk", by_joint, by_joint, weights)
-    share = np.einsum("ncj,nc,n->nj", by_joint, errors, weights)
-    values, vectors = np.linalg.eigh(np.add.reduceat(inner, starts))
-    values = values.clip(0)
-    share = np.einsum("kji,kj->ki", vectors, np.add.reduceat(share, starts)) ** 2
-    total = float((weights[:, None] * errors**2).sum())
+    errors, starts = errors.ravel(), _starts(problem)
 
     def surprise(logs: Array) -> float:
-        variance, ratio = np.exp(2 * logs[0]), np.exp(2 * (logs[1] - logs[0]))
-        inside = 1 + ratio * values
-        square = (total - (ratio * share / inside).sum()) / variance
-        return float(
-            (
-                errors.size * 2 * logs[0]
-                - 2 * np.log(weights).sum()
-                + np.log(inside).sum()
-                + square
-            )
-            / 2
-        )
+        blocks = _covariances(problem, jacobian, Noise(*np.exp(logs)), weights, starts)
+        return sum(
+            np.linalg.slogdet(block)[1] + errors[own] @ np.linalg.solve(block, errors[own])
+            for own, block in blocks
+        ) / 2  # fmt: skip
 
     if given is None:
         start, bounds = np.log([0.3, np.radians(0.5)]), np.log([PIXELS, JOINTS])
@@ -212,8 +222,6 @@ def _noise(
 def _misfit(problem: Reprojection, state: Array, noise: Noise) -> Array:
     """Mean square deviation of each tag in each picture, in units of what noise explains."""
     errors, jacobian = _errors(problem, state)
-    errors = errors.reshape(-1, 8)
-    moved = noise.joints * jacobian[..., problem.offsets].reshape(len(errors), 8, -1)
-    covariance = noise.pixels**2 * np.eye(8) + moved @ moved.swapaxes(1, 2)
-    solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
-    return np.asarray((errors * solved).mean(1))
+    errors, n = errors.ravel(), len(errors)
+    blocks = _covariances(problem, jacobian, noise, np.ones(n), np.arange(0, n + 1, 4))
+    return np.array([errors[own] @ np.linalg.solve(b, errors[own]) / 8 for own, b in blocks])

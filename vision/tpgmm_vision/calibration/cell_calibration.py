@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,20 +17,17 @@ from scipy.spatial.transform import Rotation
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.calibration.adjustment import OFFSET_PRIOR, Adjustment, adjust
-from tpgmm_vision.calibration.reprojection import Corners, Integers, Reprojection
+from tpgmm_vision.calibration.reprojection import Corners, Reprojection
 from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.estimation import View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
-from tpgmm_vision.poses import Array, angle_between, inverse, mean_pose, rigid
+from tpgmm_vision.poses import Array, inverse, mean_pose, rigid
 from tpgmm_vision.targets import Target
 
 __all__ = ["CellCalibration", "Mount", "calibrate_cell"]
 
-#: Closed forms of OpenCV for the camera on a hand; none is best everywhere.
-CLOSED_FORMS = (
-    cv2.CALIB_HAND_EYE_PARK, cv2.CALIB_HAND_EYE_TSAI, cv2.CALIB_HAND_EYE_HORAUD,
-    cv2.CALIB_HAND_EYE_DANIILIDIS,
-)  # fmt: skip
+#: Closed forms of OpenCV for the camera on a hand, from Tsai's to Daniilidis'; none is best.
+CLOSED_FORMS = range(5)
 #: Pictures of each camera at least, and parts of them that are left out in turns.
 LEAST_PICTURES, FOLDS = 8, 5
 #: A tag whose corners are this many times further off than noise explains is a wrong one.
@@ -107,22 +106,18 @@ class CellCalibration:
             np.quantile(values, (0.5, 0.95))
             for values in (1e3 * self.position_errors, np.degrees(self.angle_errors))
         )
-        offsets = [
+        offsets = ", ".join(
             f"{name} {np.degrees(value):+.2f} +- {np.degrees(self.uncertainty[name]):.2f}"
             for name, value in self.joint_offsets.items()
             if name not in self.unknown
-        ]
-        lines = [
+        )
+        unknown = "\nnot known from these postures, poses make up for them: "
+        return (
             f"error between object and hand, on pictures left out: {far[0]:.1f} mm (median), "
-            f"{far[1]:.1f} mm (95 %); {turned[0]:.2f} and {turned[1]:.2f} deg",
-            f"offsets of joints [deg]: {', '.join(offsets) or 'none'}",
-        ]
-        if self.unknown:
-            lines.append(
-                "not known from these postures, poses make up for them: "
-                f"{', '.join(self.unknown)}"
-            )
-        return "\n".join(lines)
+            f"{far[1]:.1f} mm (95 %); {turned[0]:.2f} and {turned[1]:.2f} deg\n"
+            f"offsets of joints [deg]: {offsets or 'none'}"
+            + (unknown + ", ".join(self.unknown) if self.unknown else "")
+        )
 
 
 def calibrate_cell(
@@ -162,7 +157,7 @@ def calibrate_cell(
     """
     given = np.asarray(joints, dtype=float), robot, seen, cameras, mounts, bases
     _check(*given)
-    task = _Task.of(*given)
+    task = _Task(*given)
     first = adjust(task.problem, task.start(), robust=True)
     wrong = first.misfit > WRONG_TAG**2
     problem = replace(task.problem, corners=task.problem.corners.of(np.repeat(~wrong, 4)))
@@ -182,7 +177,6 @@ def calibrate_cell(
     return task.result(fit, unknown, problems)
 
 
-@dataclass(frozen=True, eq=False)
 class _Task:
     """What is calibrated, and the poses of targets that each picture tells.
 
@@ -190,62 +184,50 @@ class _Task:
     camera's frame.
     """
 
-    problem: Reprojection
-    cameras: list[str]
-    mounts: list[str]
-    bases: Sequence[str]
-    views: dict[tuple[int, int], tuple[Integers, Array]]
-
-    @classmethod
-    def of(
-        cls, joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
+    def __init__(
+        self, joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
         cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
-    ) -> _Task:  # fmt: skip
-        """Put all corners in a row."""
-        tags = [
-            (k, i, j, found[k].corners)
-            for k in range(len(joints))
-            for i, found in enumerate(seen.values())
-            for j, mount in enumerate(mounts.values())
-            if found[k].corners.keys() & mount.target.corners.keys()
-        ]
+    ) -> None:  # fmt: skip
+        self.cameras, self.mounts, self.bases = list(seen), list(mounts), bases
         lenses = [cameras[name].camera for name in seen]
-        targets = [mount.target for mount in mounts.values()]
+        targets, shown = [mount.target for mount in mounts.values()], list(seen.values())
         rows = [
-            (k, i, j, number, corners[number], targets[j].corners[number])
-            for k, i, j, corners in tags
-            for number in corners.keys() & targets[j].corners.keys()
+            (k, i, j, number, found[k].corners[number], target.corners[number])
+            for k in range(len(joints))
+            for i, found in enumerate(shown)
+            for j, target in enumerate(targets)
+            for number in found[k].corners.keys() & target.corners.keys()
         ]
+        pictures = dict.fromkeys(row[:3] for row in rows)
         for i, name in enumerate(seen):
-            if (n := len({k for k, at, *_ in tags if at == i})) < LEAST_PICTURES:
+            if (n := len({k for k, at, _ in pictures if at == i})) < LEAST_PICTURES:
                 raise DataError(
                     f"camera {name!r} sees tags of {list(mounts)} in {n} of {len(joints)} "
                     f"pictures, {LEAST_PICTURES} are needed: is it the camera that sees them, "
                     "are their numbers right, and are they large enough in the picture (20 "
                     "pixels an edge)?"
                 )
-        if lost := [name for j, name in enumerate(mounts) if j not in {one[2] for one in tags}]:
+        if lost := [
+            name for j, name in enumerate(mounts) if j not in {j for *_, j in pictures}
+        ]:
             raise DataError(f"no camera sees tags of {lost}: are their numbers right?")
-        views = dict[tuple[int, int], tuple[Integers, Array]]()
-        for pair in dict.fromkeys((i, j) for _, i, j, _ in tags):
-            all_of = [
-                (k, estimate_pose([View(lenses[i], np.eye(4), corners)], targets[j]))
-                for k, i, j, corners in tags
-                if (i, j) == pair
-            ]
-            found = [(k, one) for k, one in all_of if one is not None]
+        views = self.views = defaultdict[tuple[int, int], list[Any]](list)
+        for k, i, j in pictures:
+            view = View(lenses[i], np.eye(4), shown[i][k].corners)
+            if one := estimate_pose([view], targets[j]):
+                views[i, j].append((one.valid, k, one.pose))
+        for pair, found in views.items():
             # those that cannot be trusted only where there are no others
-            good = [(k, one) for k, one in found if one.valid]
-            found = good if len(good) >= LEAST_PICTURES else found
-            views[pair] = np.array([k for k, _ in found]), np.array([e.pose for _, e in found])
+            good = [one for one in found if one[0]]
+            _, *columns = zip(*(good if len(good) >= LEAST_PICTURES else found), strict=True)
+            views[pair] = list(map(np.array, columns))
         *places, pixels, points = zip(*rows, strict=True)
         corners = Corners(
             np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(places), 4, 1)
         )
         carriers = [cameras[name].link for name in seen] + [one.link for one in mounts.values()]
         own = [{link for link in robot.links if link.startswith(base)} for base in bases]
-        problem = Reprojection(robot, joints, corners, lenses, carriers, own)
-        return cls(problem, list(seen), list(mounts), bases, views)
+        self.problem = Reprojection(robot, joints, corners, lenses, carriers, own)
 
     def start(self) -> Array:
         """The state by closed forms, pair by pair of a camera and a target."""
@@ -303,23 +285,13 @@ class _Task:
     def check_steady(self, fit: Adjustment) -> None:
         """Refuse a camera, or tags in a hand, that moved on the way."""
         problem, names = fit.problem, [*self.cameras, *self.mounts]
-        q, _ = np.linalg.qr(fit.jacobian)
-        postures = np.repeat(problem.corners.posture, 2)
-        column, found = np.cumsum(problem.free) - 1, []
-        for part in range(len(problem.carriers)):
-            own, gains = fit.jacobian[: len(postures), column[6 * part :][:6]], {}
-            for at in np.unique(postures)[2:-1]:
-                late = np.zeros((len(fit.left), 6))
-                late[: len(postures)] = own * (postures >= at)[:, None]
-                late -= q @ (q.T @ late)
-                step = np.linalg.lstsq(late, fit.left, rcond=1e-9)[0]
-                gains[int(at)] = float(fit.left @ late @ step)
-            at = max(gains, key=lambda at: gains[at])
-            moved, new = _divided(fit, part, at)
-            before, after = moved.problem.split(moved.state)[0][[part + (new < part), new]]
-            found.append((fit.surprise - moved.surprise, part, at, inverse(before) @ after))
-        gain, part, at, step = max(found, key=lambda one: one[0])
-        moved_by, turned = np.linalg.norm(step[:3, 3]), angle_between(np.eye(4), step)
+        postures, steps = np.repeat(problem.corners.posture, 2), list[Any]()
+        for part, at in product(range(len(problem.carriers)), np.unique(postures)[2:-1]):
+            late, n = np.zeros((len(fit.left), 6)), len(postures)
+            late[:n] = fit.jacobian[:n, 6 * part :][:, :6] * (postures >= at)[:, None]
+            steps.append((*fit.gain(late), part, int(at)))
+        gain, step, _, part, at = max(steps, key=lambda one: one[0])
+        moved_by, turned = np.linalg.norm(step.reshape(2, 3), axis=1)
         if gain > STEP_EVIDENCE and (moved_by > LEAST_STEP[0] or turned > LEAST_STEP[1]):
             raise DataError(
                 f"{'camera' if part < len(self.cameras) else 'target'} {names[part]!r} was "
@@ -372,12 +344,9 @@ class _Task:
     def scales(self, fit: Adjustment) -> tuple[str, ...]:
         """Whether another focal length or size of tags explains clearly more, and which."""
         found = list[tuple[float, str]]()
-        for number, at in enumerate(range(fit.problem.n_steps)[fit.problem.scales]):
-            free = fit.problem.free.copy()
-            free[at] = True
-            other = adjust(replace(fit.problem, free=free), fit.state)
-            value = 100 * other.problem.split(other.state)[2][number]
-            amount = f"{abs(value):.1f} +- {100 * other.covariance()[at, at] ** 0.5:.1f} %"
+        for number, column in enumerate(fit.jacobian.T[fit.problem.scales]):
+            gain, [value], [spread] = fit.gain(column[:, None])
+            amount = f"{100 * abs(value):.1f} +- {100 * spread:.1f} %"
             text = (
                 f"tags are {amount} {'larger' if value > 0 else 'smaller'} than said: measure "
                 "one with a ruler"
@@ -386,7 +355,7 @@ class _Task:
                 f"{'small' if value > 0 else 'large'}: calibrate it again, by pictures that "
                 "are not cropped or scaled"
             )
-            found.append((fit.surprise - other.surprise, text))
+            found.append((gain, text))
         best = max(found)[0]
         likely = [text for gain, text in found if best - gain < SCALE_EVIDENCE / 2]
         return (" or ".join(likely),) if best > SCALE_EVIDENCE else ()
@@ -405,45 +374,27 @@ class _Task:
                 away += [*(inverse(placed[own, i] @ poses[left]) @ placed[own, n + j])]
         poses, offsets, _ = problem.split(fit.state)
         spread = np.diag(fit.covariance())[problem.offsets] ** 0.5
-        joints = list(zip(problem.robot.joint_names, self.problem.free[problem.offsets],
-                          offsets.tolist(), spread.tolist(), unknown, strict=True))  # fmt: skip
-        (pixels, *_), c = self.problem.expected(fit.state), self.problem.corners
+        names, moves = np.array(problem.robot.joint_names), self.problem.free[problem.offsets]
+        known, errors = (
+            dict(zip(names[moves].tolist(), values[moves].tolist(), strict=True))
+            for values in (offsets, spread)
+        )
+        pixels, c = self.problem.expected(fit.state)[0], self.problem.corners
         expected = defaultdict[tuple[str, int], dict[int, Array]](dict)
         for k in range(0, len(pixels), 4):
             place = self.cameras[c.camera[k]], int(c.posture[k])
             expected[place][int(c.number[k])] = pixels[k : k + 4]
+        parts = np.split(poses, [n, len(problem.carriers)])
+        cameras, mounts, bases = (
+            dict(zip(names, part, strict=True))
+            for names, part in zip((self.cameras, self.mounts, self.bases), parts, strict=True)
+        )
         return CellCalibration(
-            dict(zip(self.cameras, poses[:n], strict=True)),
-            dict(zip(self.mounts, poses[n:], strict=False)),
-            dict(zip(self.bases, poses[len(problem.carriers) :], strict=True)),
-            {name: value for name, moves, value, _, _ in joints if moves},
-            {name: error for name, moves, _, error, _ in joints if moves},
-            tuple(name for name, *_, one in joints if one),
+            cameras, mounts, bases, known, errors, tuple(names[unknown].tolist()),
             np.linalg.norm(np.array(away)[:, :3, 3], axis=1),
             Rotation.from_matrix(np.array(away)[:, :3, :3]).magnitude(),
             fit.noise.joints, problems, expected,
         )  # fmt: skip
-
-
-def _divided(fit: Adjustment, part: int, at: int) -> tuple[Adjustment, int]:
-    """A fit with one part as two, before and after a posture; and which part is the later."""
-    problem, n = fit.problem, len(fit.problem.cameras)
-    kind, number, new = (
-        ("camera", part, n) if part < n else ("target", part - n, len(problem.carriers))
-    )
-    corners, cameras, carriers = problem.corners, list(problem.cameras), list(problem.carriers)
-    poses, offsets, _ = problem.split(fit.state)
-    late = (corners.posture >= at) & (getattr(corners, kind) == number)
-    index = np.where(late, new if part < n else new - n, getattr(corners, kind))
-    cameras += cameras[part:][:1] if part < n else []
-    carriers.insert(new, carriers[part])
-    other = replace(
-        problem, corners=replace(corners, **{kind: index}), cameras=cameras, carriers=carriers,
-        free=np.zeros(0, dtype=bool),
-    )  # fmt: skip
-    state = other.state(np.insert(poses, new, poses[part], axis=0))
-    other.split(state)[1][:] = offsets
-    return adjust(other, state), new
 
 
 def _check(
@@ -460,10 +411,9 @@ def _check(
             raise UnknownNameError("camera", name, "the cell", cameras)
         if len(found) != len(joints):
             raise DataError(f"camera {name!r} has {len(found)} pictures for {len(joints)} rows")
-        for posture, one in enumerate(found):
-            if one.twice:
-                raise DataError(f"camera {name!r} sees tags {sorted(one.twice)} twice in "
-                                f"picture {posture}: cover or remove the others")  # fmt: skip
+        if twice := {k: sorted(one.twice) for k, one in enumerate(found) if one.twice}:
+            raise DataError(f"camera {name!r} sees tags twice, by picture {twice}: cover or "
+                            "remove the others")  # fmt: skip
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")

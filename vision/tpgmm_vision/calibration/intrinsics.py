@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.calibration.recorded import spread
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.poses import Array
@@ -20,8 +19,8 @@ from tpgmm_vision.targets import Board
 
 __all__ = ["CameraCalibration", "calibrate_camera"]
 
-#: Pictures at least and at most, corners in each at least, and parts left out in turns.
-LEAST_PICTURES, MOST_PICTURES, LEAST_CORNERS, FOLDS = 8, 40, 8, 4
+#: Pictures at least, corners in each at least, and parts left out in turns.
+LEAST_PICTURES, LEAST_CORNERS, FOLDS = 8, 8, 4
 #: The picture is divided into so many fields to a side, of which so many must have corners.
 FIELDS, LEAST_COVERED = 4, 12
 #: Sides from which the board is seen differ at least by this, root mean square [rad]: seen from
@@ -66,9 +65,8 @@ class CameraCalibration:
     def __str__(self) -> str:
         fx, fy = self.camera.focal_length
         return (
-            f"focal length {fx:.1f}, {fy:.1f} pixels; error on pictures left out "
-            f"{self.pixel_error:.2f} pixels, {2e3 * self.pixel_error / (fx + fy):.2f} mm at 1 "
-            f"m; from {len(self.pictures)} pictures"
+            f"focal length {fx:.1f}, {fy:.1f} pixels, from {len(self.pictures)} pictures; on "
+            f"others {self.pixel_error:.2f} pixels off, {1e3 * self.pixel_error / fx:.2f} mm/m"
         )
 
 
@@ -80,7 +78,7 @@ def calibrate_camera(
     Parameters
     ----------
     pictures : mapping of str to ndarray of uint8, shape (height, width, 3) or (height, width)
-        By name; of many, those are taken that differ most.
+        By name.
     board : Board
         Its size does not matter, its shape does.
 
@@ -103,7 +101,8 @@ def calibrate_camera(
     _check_covered(views, size)
     fixed = cv2.CALIB_FIX_K3
     worst = _fitted(views, size, fixed)[1]
-    blurred = [n for n, e in worst.items() if e > BLURRED * np.median([*worst.values()])]
+    limit = BLURRED * np.median([*worst.values()])
+    blurred = [name for name, error in worst.items() if error > limit]
     views = {name: view for name, view in views.items() if name not in blurred}
     errors = {flags: _left_out(views, size, flags) for flags in (fixed, 0)}
     flags = 0 if errors[0] < HELPS * errors[fixed] else fixed
@@ -121,10 +120,8 @@ def calibrate_camera(
         problems.append(f"no board in {without}, a blurred one in {blurred}: they do not count")
     fx, fy = camera.focal_length
     if abs(fx / fy - 1) > SQUARE:
-        problems.append(
-            f"focal lengths differ by {100 * abs(fx / fy - 1):.1f} %: is the print stretched? "
-            "Measure both of its edges with a ruler"
-        )
+        problems.append(f"focal lengths {fx:.1f} and {fy:.1f} differ: is the print stretched? "
+                        "Measure both of its edges with a ruler")  # fmt: skip
     return CameraCalibration(camera, errors[flags], tuple(views), tuple(problems))
 
 
@@ -148,37 +145,18 @@ def _views(
         start = np.ascontiguousarray(corners - np.float32(0.5))
         pixels = cv2.cornerSubPix(image, start, (window, window), (-1, -1), ENDS)
         found[name] = points.reshape(-1, 3), pixels.reshape(-1, 2)
-    names, away = list(found), np.array([_corners_of(*view) for view in found.values()])
-    chosen = (
-        spread(away, MOST_PICTURES, 0.0) if len(found) > MOST_PICTURES else range(len(names))
-    )
-    return {names[k]: found[names[k]] for k in chosen}, without
-
-
-def _corners_of(points: Array, pixels: Array) -> Array:
-    """Where the corners of a square on the board are in the picture (8,) [pixels]."""
-    extent = np.ptp(points[:, :2], axis=0).max()
-    plane, _ = cv2.findHomography(points[:, :2] / extent, pixels)
-    seen = plane @ np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1.0]]).T
-    return np.asarray((seen[:2] / seen[2]).ravel())
+    return found, without
 
 
 def _check_covered(views: Views, size: Sequence[int]) -> None:
     """Refuse corners that leave parts of the picture to extrapolation."""
     pixels = np.concatenate([pixels for _, pixels in views.values()])
     fields = np.minimum(pixels / size * FIELDS, FIELDS - 1).astype(int).clip(0)
-    covered = np.zeros((FIELDS, FIELDS), dtype=bool)
-    covered[fields[:, 1], fields[:, 0]] = True
-    sides = covered[0], covered[-1], covered[:, 0], covered[:, -1]
-    names = "top", "bottom", "left", "right"
-    bare = [
-        name for name, side in zip(names, sides, strict=True) if side.sum() < FIELDS / 2
-    ] or ["the corners"]
-    if covered.sum() < LEAST_COVERED:
+    covered = len(np.unique(fields, axis=0))
+    if covered < LEAST_COVERED:
         raise DataError(
-            f"the board was seen in {covered.sum()} of the picture's {FIELDS} x {FIELDS} "
-            f"fields, {LEAST_COVERED} are needed: take pictures of it near the edges: "
-            f"{', '.join(bare)}"
+            f"the board was seen in {covered} of the picture's {FIELDS} x {FIELDS} fields, "
+            f"{LEAST_COVERED} are needed: take pictures of it near the edges and corners"
         )
 
 
@@ -191,11 +169,9 @@ def _fitted(
         points, pixels, size, None, None, flags=flags, criteria=ENDS
     )
     _, matrix, lens, turns, _, spread, _, errors = found
-    camera = Camera(
-        int(size[0]), int(size[1]), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]),
-        tuple(lens.ravel()[:5].tolist()),
-    )  # fmt: skip
-    uncertain = float((spread.ravel()[:2] / np.diag(matrix)[:2]).max())
+    lengths, centre = np.diag(matrix)[:2], matrix[:2, 2]
+    camera = Camera(size[0], size[1], tuple(lengths), tuple(centre), tuple(lens.ravel()[:5]))
+    uncertain = float((spread.ravel()[:2] / lengths).max())
     per_picture = dict(zip(views, errors.ravel().tolist(), strict=True))
     return camera, per_picture, np.array(turns).reshape(-1, 3), uncertain
 

@@ -1,27 +1,26 @@
-"""Pictures for calibrations: of folders, videos and LeRobot data sets."""
+"""Pictures for calibrations: of boards, and of postures in LeRobot data sets."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
+from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.reader import Recording
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import grey
-from tpgmm_vision.episodes.video import EpisodePictures, Picture
+from tpgmm_vision.episodes.video import EpisodePictures, Picture, frames
 from tpgmm_vision.poses import Array
 
 __all__ = ["board_pictures", "slow_postures", "spread"]
 
-#: Pictures of a video that are looked at, and postures of a recording; of so many at least the
-#: robot may move faster than it should.
-FRAMES, POSTURES, LEAST_POSTURES = 200, 60, 15
+#: Pictures of a longer video, up to twice as many, and postures of a recording; in so many at
+#: least the robot may move faster than it should.
+FRAMES, POSTURES, LEAST_POSTURES = 40, 60, 15
 #: A joint that turns slower moves by less than 0.2 deg in the 20 ms that a picture may be late
 #: [rad/s].
 SLOW = 0.2
@@ -29,62 +28,31 @@ SLOW = 0.2
 SAME = float(np.radians(2.0))
 
 
-def board_pictures(
-    source: Path, key: str, recording: Recording | None = None
-) -> dict[str, Picture]:
-    """Grey pictures by name: all of a folder, or evenly those of a video or a data set.
-
-    Parameters
-    ----------
-    source : Path
-        A folder of pictures or a video.
-    key : str
-        The camera's feature in a data set.
-    recording : Recording, optional
-        The data set, if it is one.
+def board_pictures(source: Path) -> dict[str, Picture]:
+    """Grey pictures by name: all of a folder, or evenly those of a video.
 
     Raises
     ------
     DataError
         If there are none.
     """
-    found = dict[str, Picture]()
-    if recording is not None:
-        rows = _rows(recording)
-        reader = EpisodePictures(recording.assembly.layout, [key])
-        step = max(sum(len(one.time) for one in rows) // FRAMES, 1)
-        for one in rows:
-            for k, images in enumerate(reader.read(one.episode, one.time)):
-                if k % step == 0:
-                    found[f"episode {one.episode.index}, row {k}"] = grey(images[key])
-    elif source.is_dir():
+    found, step = dict[str, Picture](), 1
+    if source.is_dir():
         read = ((file.name, cv2.imread(str(file), 0)) for file in sorted(source.iterdir()))
         found = {name: picture for name, picture in read if picture is not None}
-    else:
-        try:
-            with av.open(str(source)) as container:
-                step = max(container.streams.video[0].frames // FRAMES, 1)
-                for number, frame in enumerate(container.decode(video=0)):
-                    if number % step == 0:
-                        found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
-        except (av.error.FFmpegError, IndexError) as error:
-            raise DataError(f"{source} is no folder, video or data set ({error})") from error
+    for number, (_, frame) in enumerate(frames(source, 0.0, {}) if source.is_file() else ()):
+        if number % step == 0:
+            found[f"frame {number}"] = grey(frame.to_ndarray(format="rgb24"))
+        if len(found) == 2 * FRAMES:
+            found, step = dict([*found.items()][::2]), 2 * step
     if not found:
-        raise DataError(f"there are no pictures in {source}")
+        raise DataError(f"{source} is no folder of pictures and no video")
     return found
 
 
-def _rows(recording: Recording) -> list[EpisodeRows]:
-    """The rows of all episodes, without pictures."""
-    assembly = recording.assembly
-    return list(
-        read_episodes(assembly.layout, recording.episodes, assembly.features, Relaxed(()))
-    )
-
-
 def slow_postures(
-    recording: Recording, keys: Mapping[str, str], most: int = POSTURES
-) -> tuple[Array, Iterator[tuple[int, dict[str, Picture]]]]:
+    recording: Recording, keys: Mapping[str, str]
+) -> tuple[Array, Iterator[dict[str, Picture]]]:
     """Postures where a robot moves slowly, those that differ most, and pictures there.
 
     Parameters
@@ -92,37 +60,33 @@ def slow_postures(
     recording : Recording
     keys : mapping of str to str
         Features of cameras by their names.
-    most : int, default=60
-        Postures at most.
 
     Returns
     -------
     joints : ndarray of shape (n, n_joints)
         [rad]
-    pictures : iterator of (int, dict)
-        The number of the posture, and pictures by the names of cameras.
+    pictures : iterator of dict
+        Of each posture the pictures by the names of cameras.
     """
-    assembly, rows = recording.assembly, _rows(recording)
-    reader = EpisodePictures(assembly.layout, list(keys.values()))
+    assembly = recording.assembly
+    layout, features = assembly.layout, assembly.features
+    rows = list(read_episodes(layout, recording.episodes, features, Relaxed(())))
+    reader = EpisodePictures(layout, list(keys.values()))
     tables = [assembly.demonstration(one).joints.double().numpy() for one in rows]
     speed = np.concatenate([
         np.abs(np.gradient(table, one.time, axis=0)).max(1) if len(table) > 1 else [0.0]
         for table, one in zip(tables, rows, strict=True)
     ])  # fmt: skip
     joints = np.concatenate(tables)
-    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[: min(LEAST_POSTURES, most)][-1]))
-    chosen = slow[spread(joints[slow], most)].tolist()
+    slow = np.flatnonzero(speed <= max(SLOW, np.sort(speed)[:LEAST_POSTURES][-1]))
+    chosen = slow[spread(joints[slow], POSTURES)].tolist()
 
-    def pictures() -> Iterator[tuple[int, dict[str, Picture]]]:
+    def pictures() -> Iterator[dict[str, Picture]]:
         first = 0
         for one in rows:
-            wanted = {k - first for k in chosen if first <= k < first + len(one.time)}
-            images = reader.read(one.episode, one.time) if wanted else iter(())
-            for k in range(max(wanted, default=-1) + 1):
-                shown = next(images)
-                if k in wanted:
-                    number = chosen.index(first + k)
-                    yield number, {name: shown[key] for name, key in keys.items()}
+            wanted = [k - first for k in chosen if 0 <= k - first < len(one.time)]
+            for _, shown in reader.read(one.episode, one.time, wanted):
+                yield {name: shown[key] for name, key in keys.items()}
             first += len(one.time)
 
     return joints[chosen], pictures()

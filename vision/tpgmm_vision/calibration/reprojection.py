@@ -153,13 +153,9 @@ class Reprojection:
         joints = (self.joints if joints is None else joints) + offsets
         found = self.robot.state(torch.as_tensor(joints))
         values = torch.cat((found.positions, found.orientations), -1).numpy()
-        values = np.concatenate(
-            (values, np.tile([0, 0, 0, 1.0, 0, 0, 0], (len(values), 1, 1))), 1
-        )
-        links, jacobians = (
-            pose_matrix(values),
-            np.pad(found.jacobians.numpy(), ((0, 0), (0, 1), (0, 0), (0, 0))),
-        )
+        still = np.tile([0, 0, 0, 1.0, 0, 0, 0], (len(values), 1, 1))
+        links = pose_matrix(np.concatenate((values, still), 1))
+        jacobians = np.pad(found.jacobians.numpy(), ((0, 0), (0, 1), (0, 0), (0, 0)))
         for number, base in enumerate(poses[len(self.carriers) :]):
             own, turn = self.base_of == number, block_diag(base[:3, :3], base[:3, :3])
             links[:, own], jacobians[:, own] = base @ links[:, own], turn @ jacobians[:, own]

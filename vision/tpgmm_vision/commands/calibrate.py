@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import typer
 from rich.progress import Progress
 
 from tpgmm_tools.cli import options
-from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["app"]
@@ -30,7 +28,6 @@ def camera(
     columns: int = 8,
     rows: int = 5,
     family: str = "aruco_5x5",
-    episodes: str | None = None,
 ) -> None:
     """Find a camera's focal length and distortion by pictures of a ChArUco board.
 
@@ -39,8 +36,8 @@ def camera(
 
     Parameters
     ----------
-    pictures : ``DIR | VIDEO | SET``
-        A folder of pictures, a video, or a LeRobot data set.
+    pictures : ``DIR | VIDEO``
+        A folder of pictures or a video, such as one of a LeRobot data set.
     name : str
         Of the camera.
     cell : ``CELL.json``
@@ -53,27 +50,22 @@ def camera(
         Squares of the board.
     family : ``NAME``
         Of the tags in it.
-    episodes : ``0:10 | 0,3,5``
-        Of a data set; default all.
     """
     from tpgmm_vision.calibration.intrinsics import calibrate_camera
     from tpgmm_vision.calibration.recorded import board_pictures
-    from tpgmm_vision.cell import camera_content, write_cell
+    from tpgmm_vision.cell import camera_content, read_cell, write_cell
     from tpgmm_vision.targets import Board
 
-    content, key, recording = _content(cell), key or f"observation.images.{name}", None
-    if (pictures / "meta" / "info.json").exists():
-        reading = options.DataOptions(episodes=episodes, units=["raw"])
-        recording = reading.opened(str(pictures), None, frames={})
-    shown = board_pictures(pictures, key, recording)
-    result = calibrate_camera(shown, Board(columns, rows, family=family))
-    entry = {**camera_content(result.camera, key), **({"link": link} if link else {})}
-    entry["report"] = str(result)
-    content.setdefault("cameras", {})[name] = entry
+    key = key or f"observation.images.{name}"
+    content: dict[str, Any] = dict(read_cell(cell).content) if cell.exists() else {}
+    result = calibrate_camera(board_pictures(pictures), Board(columns, rows, family=family))
+    entry = camera_content(result.camera, key) | ({"link": link} if link else {})
+    content.setdefault("cameras", {})[name] = entry | {"report": str(result)}
     write_cell(content, cell)
-    lines = [f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)]
-    next_ = f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ..."
-    typer.echo("\n".join([*lines, next_]))
+    typer.echo(
+        "\n".join([f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)])
+    )
+    typer.echo(f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ...")
 
 
 @options.command(
@@ -131,17 +123,18 @@ def cell(
     from tpgmm_vision.episodes.report import drawn
     from tpgmm_vision.targets import target_from
 
-    known, content, hands = read_cell(cell).cameras, _content(cell), hand or []
+    before = read_cell(cell)
+    known, content = before.cameras, dict(before.content)
     if unknown := [name for name in camera or () if name not in known]:
         raise UnknownNameError("camera", unknown[0], "the cell", known)
     cameras = {name: known[name] for name in camera or known}
-    entries = {one.partition("=")[0]: _target(one) for one in [*hands, *(check or ())]}
+    hands, checks = (dict(map(_target, several or ())) for several in (hand, check))
     mounts = {
-        name: Mount(target_from(entry, name), name if k < len(hands) else None)
-        for k, (name, entry) in enumerate(entries.items())
+        name: Mount(target_from(entry, name), name if name in hands else None)
+        for name, entry in {**checks, **hands}.items()
     }
-    links = {mount.link for mount in mounts.values()} | {one.link for one in cameras.values()}
-    wanted = {*(described.link or ()), *(link for link in links if link)}
+    carriers = {one.link for one in cameras.values() if one.link}
+    wanted = carriers.union(hands, described.link or ())
     robot = replace(described, link=sorted(wanted)).read()
     if robot is None or not cameras or not mounts:
         raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
@@ -149,32 +142,29 @@ def cell(
     if content.get("joints", names := list(robot.joint_names)) != names:
         raise DataError(f"{cell} is of a robot with joints {content['joints']}, this one has "
                         f"{names}: give another --cell")  # fmt: skip
-    families = {mount.target.family for mount in mounts.values()}
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
     recording = reading.opened(path, robot, frames={})
     joints, pictures = slow_postures(recording, {n: one.key for n, one in cameras.items()})
-    find = TagDetector(families.pop())
-    shown: dict[tuple[str, int], Any] = {}
+    find, shown = TagDetector(), list[tuple[str, int, Any]]()
     seen: dict[str, list[Detections]] = {name: [] for name in cameras}
     with Progress(transient=True) as bar:
-        for k, images in bar.track(pictures, total=len(joints), description="looking"):
+        for k, images in enumerate(bar.track(pictures, len(joints), description="looking")):
             for name, image in images.items():
                 cameras[name].camera.check(image, name)
-                shown[name, k] = image
+                shown.append((name, k, image))
                 seen[name].append(find(image))
     result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
     for name, pose in result.cameras.items():
         report = str(result).splitlines()[0]
         content["cameras"][name] |= {"pose": pose_content(pose), "report": report}
-    for name in check or ():
-        name = name.partition("=")[0]
-        entry = {"target": entries[name], "pose": pose_content(result.mounts[name])}
-        content.setdefault("checks", {})[name] = entry
+    for name, entry in checks.items():
+        placed = {"target": entry, "pose": pose_content(result.mounts[name])}
+        content.setdefault("checks", {})[name] = placed
     offsets = result.joint_offsets.items()
     content["joints"] = names
     content["joint_offsets"] = {n: round(v, 6) for n, v in offsets if n not in result.unknown}
     out.mkdir(parents=True, exist_ok=True)
-    for (name, k), image in shown.items():
+    for name, k, image in shown:
         jpeg = drawn(image, seen[name][k].corners, result.expected.get((name, k), {}))
         (out / f"{name}_{k:03}.jpg").write_bytes(jpeg)
     write_cell(content, cell)
@@ -186,25 +176,15 @@ def cell(
     typer.echo("\n".join([*lines, f"written to {cell}, {next_}"]))
 
 
-def _target(text: str) -> dict[str, Any]:
-    """What a cell file says of a target that an option describes."""
+def _target(text: str) -> tuple[str, dict[str, Any]]:
+    """The name of a target that an option describes, and what a cell file says of it."""
     name, _, described = text.partition("=")
     try:
         kind, numbers, size = described.split(":")
         several = [int(number) for number in numbers.split(",")]
-        made = {"cube": several, "tag": several[0]}
-        return {kind: made[kind], "size": float(size)}
+        return name, {kind: {"cube": several, "tag": several[0]}[kind], "size": float(size)}
     except (ValueError, KeyError) as error:
         raise DataError(
-            f"tags are described as {name or 'NAME'}=cube:10,11,12,13,14:0.03 or "
-            f"{name or 'NAME'}=tag:3:0.04 (numbers, and the edge in metres), got {text!r}"
+            f"tags are described as NAME=cube:10,11,12,13,14:0.03 or NAME=tag:3:0.04 (numbers, "
+            f"and the edge in metres), got {text!r}"
         ) from error
-
-
-def _content(path: Path) -> dict[str, Any]:
-    """What is in a cell file; nothing if there is none."""
-    from tpgmm_vision.cell import cell_from
-
-    content: dict[str, Any] = json.loads(read_whole(path)) if path.exists() else {}
-    cell_from(content, str(path))
-    return content

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_vision.cell import Cell, CellCamera
+from tpgmm_vision.cell import Cell, CellCamera, check_robot
 from tpgmm_vision.detection.estimation import PoseEstimate, View, estimate_pose
 from tpgmm_vision.detection.tags import Detections, TagDetector
 from tpgmm_vision.detection.tracker import Tracker
@@ -68,7 +68,7 @@ class TagSource:
         self._cameras = cell.placed()
         if not cell.objects:
             raise DataError('the cell has no objects: add them to its file under "objects"')
-        _check_robot(cell, robot)
+        check_robot(cell, robot)
         self._cell, self._robot = cell, robot
         # in the frame of the object, so that its axis and its height are those of the pose
         self._targets = {
@@ -235,25 +235,6 @@ class TagSource:
                 tuple(np.round((*(low - reach), *(high + reach))).astype(int).tolist())
             )
         return boxes
-
-
-def _check_robot(cell: Cell, robot: Kinematics | None) -> None:
-    """Refuse a cell of another robot."""
-    if robot is None:
-        if cell.links:
-            raise DataError(
-                f"cameras of the cell are on links {list(cell.links)}: give the robot"
-            )
-        return
-    for link in cell.links:
-        if link not in robot.links:
-            raise UnknownNameError("link", link, "the robot", robot.links)
-    missing = [name for name in cell.joints if name not in robot.joint_names]
-    if missing:
-        raise DataError(
-            f"the cell was calibrated with another robot: it has joints {missing}, this one "
-            f"has {list(robot.joint_names)}"
-        )
 
 
 def camera_poses(

@@ -76,9 +76,7 @@ def table(reports: Sequence[EpisodeReport]) -> list[tuple[str, ...]]:
         for name, track in report.tracks.items():
             shares = track.seen, track.known & ~track.seen, ~track.known
             first, last = _longest_gap(track)
-            gap = (
-                (last - first) * (track.time[-1] - track.time[0]) / max(len(track.time) - 1, 1)
-            )
+            gap = (last - first) * np.ptp(track.time) / max(len(track.time) - 1, 1)
             residuals = track.residuals[track.seen]
             lines.append((
                 str(report.index), name, *(f"{100 * share.mean():.0f} %" for share in shares),
@@ -95,17 +93,15 @@ def drawn(picture: Picture, seen: Mapping[int, Array], expected: Mapping[int, Ar
     if points := [*seen.values(), *expected.values()]:
         stack = np.concatenate(points)
         side = int(min(max(AROUND * np.ptp(stack, axis=0).max(), LEAST_AROUND), width, height))
-        corner = np.clip(
-            stack.mean(axis=0) - side / 2, 0, (width - side, height - side)
-        ).astype(int)
+        most = width - side, height - side
+        corner = np.clip(stack.mean(axis=0) - side / 2, 0, most).astype(int)
         picture = picture[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
     large = cv2.resize(picture, None, fx=WIDTH / side, fy=WIDTH / side)
     for colour, tags in ((EXPECTED_COLOUR, expected), (SEEN_COLOUR, seen)):
-        places = [
-            ((one - corner + 0.5) * WIDTH / side - 0.5) * 2**BITS for one in tags.values()
-        ]
-        rounded = [place.round().astype(np.int32) for place in places]
-        cv2.polylines(large, rounded, True, colour, 1, cv2.LINE_AA, BITS)
+        for one in tags.values():
+            place = ((one - corner + 0.5) * WIDTH / side - 0.5) * 2**BITS
+            outline = [place.round().astype(np.int32)]
+            cv2.polylines(large, outline, True, colour, 1, cv2.LINE_AA, BITS)
     return bytes(cv2.imencode(".jpg", large[..., ::-1])[1])
 
 
@@ -118,9 +114,8 @@ def report_page(title: str, reports: Sequence[EpisodeReport]) -> str:
     for report in reports:
         page += f"<h2>Episode {report.index}</h2>"
         for caption, picture in report.pictures:
-            source = f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}"
-            said = html.escape(caption)
             page += (
-                f'<figure><img src="{source}" alt=""><figcaption>{said}</figcaption></figure>'
+                f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(picture).decode()}'
             )
+            page += f'" alt=""><figcaption>{html.escape(caption)}</figcaption></figure>'
     return page

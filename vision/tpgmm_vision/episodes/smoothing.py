@@ -61,7 +61,10 @@ class Track:
 
     def __init__(self, time: Array) -> None:
         self.time, rows = time, len(time)
-        self.poses, self.residuals = np.tile(np.eye(4), (rows, 1, 1)), np.zeros(rows)
+        self.poses, self.residuals = (
+            np.tile(np.eye(4), (rows, 1, 1)),
+            np.zeros(rows, np.float32),
+        )
         self.seen, self.known = np.zeros((2, rows), dtype=bool)
         self.reasons = [""] * rows
         self._rest, self._tolerance, self.spread = np.full(rows, -1), REST_DISTANCE, 0.0
@@ -100,17 +103,21 @@ class Track:
             self._fill(stretch, mean)
         self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares[1:] else 0.0
         known = np.flatnonzero(self.known)
-        if known[0] > 0:
-            if self.time[known[0]] > LATE or self._rest[known[0]] < 0:
-                raise DataError(
-                    f"it was first seen {self.time[known[0]]:.2f} s after the start, "
-                    f"{'standing' if self._rest[known[0]] >= 0 else 'moving'}"
-                )
-            self._fill(slice(0, known[0]), self.poses[known[0]])
+        first, still = self.time[known[0]], self._rest[known[0]] >= 0
+        if known[0] > 0 and (first > LATE or not still):
+            how = "standing" if still else "moving"
+            raise DataError(f"it was first seen {first:.2f} s after the start, {how}")
+        self._fill(slice(0, known[0]), self.poses[known[0]])
         for a, b in pairwise(known.tolist()):
             if b > a + 1:
                 self._bridge(a, b, hands)
-        self._finish(int(known[-1]), hands)
+        last = int(known[-1])
+        rest = slice(last + 1, len(self.time))
+        self.poses[rest] = self.poses[last]
+        held = [(*self._held(hand, last), hand) for hand in hands.values()]
+        count, grasp, hand = max(held, key=lambda one: one[0], default=(0, *self.poses[:2]))
+        if count and self._rest[last] < 0:
+            self._fill(rest, hand[rest] @ grasp)
 
     def _fill(self, rows: slice, poses: Array) -> None:
         self.poses[rows], self.known[rows] = poses, True
@@ -126,9 +133,8 @@ class Track:
         else:
             self.poses[gap] = ends[0]
             found = [self._carried(hand, a, b) for hand in hands.values()]
-            off, taken, put, poses = min(
-                found, key=lambda one: one[0], default=(np.inf, a, b, ends)
-            )
+            nothing = np.inf, a, b, ends
+            off, taken, put, poses = min(found, key=lambda one: one[0], default=nothing)
             if off <= SLIP:
                 self._fill(gap, poses[gap])
                 self._fill(slice(a + 1, taken + 1), ends[0])
@@ -171,16 +177,6 @@ class Track:
         if len(held) < CARRIED_FRAMES or moved.max() < CARRIED_WAY * SLIP:
             return 0, np.full((4, 4), np.nan)
         return count, mean_pose(list(inside[held[: 4 * CARRIED_FRAMES]]))[0]
-
-    def _finish(self, last: int, hands: Mapping[str, Array]) -> None:
-        """Fill what follows the last known row."""
-        rows = slice(last + 1, len(self.time))
-        self.poses[rows] = self.poses[last]
-        found = [(*self._held(hand, last), hand) for hand in hands.values()]
-        if self._rest[last] < 0 and found:
-            count, grasp, hand = max(found, key=lambda one: one[0])
-            if count:
-                self._fill(rows, hand[rows] @ grasp)
 
 
 def _points(poses: Array) -> Array:

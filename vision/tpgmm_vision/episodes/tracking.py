@@ -12,14 +12,7 @@ import torch
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, summed_up
-from tpgmm_datasets.lerobot.columns import (
-    ACTION,
-    ENVIRONMENT,
-    KNOWN,
-    RESIDUAL,
-    SEEN,
-    with_frames,
-)
+from tpgmm_datasets.lerobot import columns as kept
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout
@@ -88,9 +81,9 @@ def track_lerobot(
     """
     folder, content, known = local_folder(path), read_whole(cell).decode(), read_cell(cell)
     layout = open_to_copy(folder, Path(out))
-    if SEEN in layout.features:
+    if kept.SEEN in layout.features:
         raise DatasetError(f"{path} was tracked: track the set that it was made from")
-    with_frames(layout.features.get(ENVIRONMENT), list(known.objects))
+    kept.with_frames(layout.features.get(kept.ENVIRONMENT), list(known.objects))
     tracker = _Tracker(layout, known, robot, progress)
     assembly = open_recording(folder, robot=robot, frames={}, **reading).assembly
     offsets = _offsets(layout, known, robot, reading.get("joint_names"))
@@ -112,16 +105,15 @@ def track_lerobot(
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
     frames: dict[str, dict[int, Frame]] = {name: {} for name in names}
-    columns = {key: Column(names, {}) for key in (SEEN, KNOWN, RESIDUAL)}
+    parts = {kept.SEEN: "seen", kept.KNOWN: "known", kept.RESIDUAL: "residuals"}
+    columns = {key: Column(names, {}) for key in parts}
     for one in reports:
-        tracks = [one.tracks[name] for name in names]
-        for name, track in zip(names, tracks, strict=True):
-            values = pose_vector(track.poses)
-            frames[name][one.index] = Frame(values[:, :3], values[:, 3:])
-        columns[SEEN].values[one.index] = np.stack([track.seen for track in tracks], 1)
-        columns[KNOWN].values[one.index] = np.stack([track.known for track in tracks], 1)
-        residuals = np.stack([track.residuals for track in tracks], 1)
-        columns[RESIDUAL].values[one.index] = residuals.astype(np.float32)
+        for name in names:
+            poses = pose_vector(one.tracks[name].poses)
+            frames[name][one.index] = Frame(poses[:, :3], poses[:, 3:])
+        for key, part in parts.items():
+            values = [getattr(one.tracks[name], part) for name in names]
+            columns[key].values[one.index] = np.stack(values, 1)
     add_frames(folder, out, frames, columns=columns, offsets=offsets, files=files)
     return reports
 
@@ -131,7 +123,7 @@ def _offsets(
 ) -> dict[str, list[float]]:
     """The joint offsets of a cell for each value of states and actions."""
     declared, given = dict[str, list[float]](), cell.joint_offsets
-    keys = {joint_feature(layout), ACTION} & layout.features.keys()
+    keys = {joint_feature(layout), kept.ACTION} & layout.features.keys()
     for key in keys if any(given.values()) else ():
         names = names_of(layout.feature(key), joint_names, robot) or ()
         matched = match_names(list(given), names, key)
@@ -142,13 +134,7 @@ def _offsets(
 class _Tracker:
     """Follows the objects of a cell through episodes."""
 
-    def __init__(
-        self,
-        layout: Layout,
-        cell: Cell,
-        robot: Kinematics | None,
-        progress: Callable[[int, int], None] | None,
-    ) -> None:
+    def __init__(self, layout: Layout, cell: Cell, robot: Any, progress: Any) -> None:
         self.cell, self.robot, self.source = cell, robot, pose_source(cell, robot)
         self.pictures = EpisodePictures(layout, [one.key for one in cell.placed().values()])
         self.progress, self.done = progress or (lambda done, total: None), 0
@@ -169,16 +155,13 @@ class _Tracker:
                 message = f"object {name!r}: {error}"
                 raise DatasetError(message, episode=report.index) from error
         wanted = report.rows_to_show()
-        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
-            if row > max(wanted):
-                break
+        for row, images in self.pictures.read(rows.episode, rows.time, wanted):
             for name, place in camera_poses(self.cell, self.robot, named[row]).items():
-                if row in wanted:
-                    expected = self._expected(report, row, name, place)
-                    picture = images[self.cell.cameras[name].key]
-                    said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
-                    seen = detected[row].get(name, {})
-                    report.pictures.append((said, drawn(picture, seen, expected)))
+                expected = self._expected(report, row, name, place)
+                picture = images[self.cell.cameras[name].key]
+                said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
+                seen = detected[row].get(name, {})
+                report.pictures.append((said, drawn(picture, seen, expected)))
         return report
 
     def _measure(
@@ -187,7 +170,7 @@ class _Tracker:
         """Put what the source measures into tracks; corners that it saw, by row and camera."""
         corners = list[dict[str, dict[int, Array]]]()
         self.source.reset()
-        for row, images in enumerate(self.pictures.read(rows.episode, rows.time)):
+        for row, images in self.pictures.read(rows.episode, rows.time):
             now, source = float(rows.time[row]), self.source
             for name, one in source.poses(images, joints[row], now).items():
                 track = report.tracks.setdefault(name, Track(rows.time))
@@ -212,9 +195,8 @@ class _Tracker:
         if robot is None or not getattr(robot, "orientation", True):  # tracked points have none
             return {}
         state = robot.state(joints.to(robot.lower))
-        poses = {link: (state.position(link), state.orientation(link)) for link in robot.links}
-        joined = {link: torch.cat(pose, -1).double() for link, pose in poses.items()}
-        return {link: pose_matrix(pose.numpy()) for link, pose in joined.items()}
+        poses = torch.cat((state.positions, state.orientations), -1).double().numpy()
+        return dict(zip(robot.links, pose_matrix(poses).swapaxes(0, 1), strict=True))
 
     def _expected(
         self, report: EpisodeReport, row: int, camera: str, place: Array

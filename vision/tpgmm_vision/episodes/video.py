@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from tpgmm_datasets.lerobot.layout import Episode, Layout, episode_file
 from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_vision.poses import Array
 
-__all__ = ["EpisodePictures", "Picture"]
+__all__ = ["EpisodePictures", "Picture", "frames"]
 
 Picture = NDArray[np.uint8]
 #: How far a picture of a video may be from the time of its row [periods]: below a half, so that
@@ -51,11 +52,9 @@ class EpisodePictures:
         self.layout, self.keys = layout, tuple(keys)
         there = [key for key, feature in layout.features.items() if feature.is_camera]
         if missing := [key for key in keys if key not in there]:
-            raise DatasetError(
-                f"the set has no pictures {missing}; its cameras are {there}. The cell says "
-                "which camera is meant, in 'key'",
-                file="meta/info.json",
-            )
+            remedy = "The cell says which camera is meant, in 'key'"
+            message = f"the set has no pictures {missing}; its cameras are {there}. {remedy}"
+            raise DatasetError(message, file="meta/info.json")
         self.videos = [key for key in keys if layout.features[key].dtype == "video"]
         self._places = dict[tuple[str, int], list[Any]]()
         for path in chunked_files(layout.root / "meta" / "episodes"):  # of v3.0
@@ -65,14 +64,18 @@ class EpisodePictures:
                 for index, *place in zip(*table.to_pydict().values(), strict=True):
                     self._places[key, index] = place
 
-    def read(self, episode: Episode, time: Array) -> Iterator[dict[str, Picture]]:
-        """The pictures of each row of an episode, RGB of shape (height, width, 3), by key.
+    def read(
+        self, episode: Episode, time: Array, rows: Collection[int] | None = None
+    ) -> Iterator[tuple[int, dict[str, Picture]]]:
+        """Rows of an episode with their pictures, RGB of shape (height, width, 3), by key.
 
         Parameters
         ----------
         episode : Episode
         time : ndarray of shape (T,)
             Of its rows, from its start [s].
+        rows : collection of int, optional
+            Which are wanted; by default all.
 
         Raises
         ------
@@ -80,27 +83,25 @@ class EpisodePictures:
             If a video or an image is missing or damaged, or a video does not fit the rows.
         """
         streams = [
-            self._video(key, episode, time)
-            if key in self.videos
-            else self._images(key, episode, len(time))
+            (self._video if key in self.videos else self._images)(key, episode, time)
             for key in self.keys
         ]
-        for pictures in zip(*streams, strict=True):
-            yield dict(zip(self.keys, pictures, strict=True))
+        stop = None if rows is None else max(rows, default=-1) + 1
+        for row, pictures in enumerate(islice(zip(*streams, strict=True), stop)):
+            if rows is None or row in rows:
+                yield row, dict(zip(self.keys, pictures, strict=True))
 
     def _video(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         layout, period = self.layout, 1 / self.layout.fps
-        place: Any = None
-        start, stop = 0.0, len(time) / layout.fps
-        if layout.version == "v3.0":
-            *place, start, stop = self._places[key, episode.index]
+        place: Any
+        *place, start, stop = self._places.get((key, episode.index), [0.0, len(time) * period])
         file = episode_file(layout.info, "video_path", episode.index, place, video_key=key)
         where: dict[str, Any] = {"file": file, "episode": episode.index, "column": key}
         if abs(stop - start - len(time) * period) > OFF_ROW * period:
             message = f"the episode takes {stop - start:.6g} s of the video, its rows "
             raise _unlike(f"{message}{len(time)} x {period:.6g} s", where)
         row, at = 0, start
-        for at, frame in _frames(layout.root / file, start, where):
+        for at, frame in frames(layout.root / file, start, where):
             if row == len(time):
                 raise _unlike(f"the video goes on behind its {row} rows", where)
             off = (at - start - time[row]) / period
@@ -112,12 +113,10 @@ class EpisodePictures:
                 if row == len(time) and place:
                     return  # others follow in the same file
         if row < len(time):
-            message = (
-                f"no picture is at {start + time[row]:.4f} s of the video, where row {row} is"
-            )
-            raise _unlike(f"{message}; the last that was looked at is at {at:.4f} s", where)
+            message = f"no picture is at {start + time[row]:.4f} s of the video, where row "
+            raise _unlike(f"{message}{row} is; the last is at {at:.4f} s", where)
 
-    def _images(self, key: str, episode: Episode, rows: int) -> Iterator[Picture]:
+    def _images(self, key: str, episode: Episode, time: Array) -> Iterator[Picture]:
         root, count = self.layout.root, 0
         where: dict[str, Any] = {"file": episode.file, "episode": episode.index, "column": key}
         batches = dataset(root / episode.file).to_batches(
@@ -127,8 +126,8 @@ class EpisodePictures:
         for stored in (one for batch in batches for one in batch[key].to_pylist()):
             yield _decoded(stored, root, where)
             count += 1
-        if count != rows:
-            raise _unlike(f"there are {count} images for {rows} rows", where)
+        if count != len(time):
+            raise _unlike(f"there are {count} images for {len(time)} rows", where)
 
 
 def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
@@ -136,7 +135,7 @@ def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
     return DatasetError(f"{problem}. {remedy}", check="metadata", **where)
 
 
-def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[float, Any]]:
+def frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[float, Any]]:
     """Time [s] and frame of a video, from the key frame before ``start`` on."""
     try:
         with av.open(str(path)) as container:
@@ -150,9 +149,7 @@ def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[f
                     raise ValueError(f"a damaged picture at {frame.time} s")
                 yield float(frame.pts * base), frame
     except (av.error.FFmpegError, IndexError, ValueError) as error:
-        problem = (
-            "damaged, or of a kind that PyAV does not read" if path.is_file() else "missing"
-        )
+        problem = "damaged, or of a kind that PyAV cannot read" if path.is_file() else "missing"
         message = f"the video is {problem} ({error})"
         raise DatasetError(message, check="missing", **where) from error
 
@@ -160,11 +157,10 @@ def _frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[f
 def _decoded(stored: Any, root: Path, where: dict[str, Any]) -> Picture:
     """A picture as LeRobot stores images: bytes of a file, or its path."""
     content, path = (stored or {}).get("bytes"), (stored or {}).get("path")
-    if content is None and path and (root / path).resolve().is_relative_to(root.resolve()):
-        content = (root / path).read_bytes() if (root / path).is_file() else None
-    found = None
-    if content:
-        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    file = (root / (path or "")).resolve()
+    if content is None and file.is_relative_to(root.resolve()) and file.is_file():
+        content = file.read_bytes()
+    found = cv2.imdecode(np.frombuffer(content, np.uint8), 1) if content else None
     if found is None:
         message = f"an image is missing or damaged (path {path!r})"
         raise DatasetError(message, check="missing", **where)
