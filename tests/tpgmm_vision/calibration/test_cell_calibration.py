@@ -72,6 +72,22 @@ def test_what_cameras_see_is_where_hands_are(make):
     assert np.radians(0.1) < found.joint_noise < np.radians(0.3)
 
 
+def test_tags_that_stand_still_are_placed_and_are_no_hand():
+    rng = np.random.default_rng(2)
+    cell = so101_cell(1.0, rng, backlash=0.0)
+    pose = rigid((0, 0, 0.5), (0.15, 0.1, 0.03))
+    cell.targets["base"] = cube([0, 1, 2, 3, 4], 0.04), pose, None
+    found = calibrated(cell, rng)
+    # the camera's turn about the vertical and an offset are one freedom: judged by the camera
+    [(place, _)] = cell.cameras.values()
+    [camera] = found.cameras.values()
+    there, said = inverse(place) @ pose, inverse(camera) @ found.mounts["base"]
+    assert np.linalg.norm((there - said)[:3, 3]) < 0.002
+    del cell.targets["base"]
+    assert np.median(away(cell, found, rng)) < 0.003
+    assert len(found.position_errors) < N  # only where the hand is seen
+
+
 def test_what_no_picture_can_tell_is_zero_and_said():
     rng = np.random.default_rng(2)
     found = calibrated(so101_cell(1.0, rng), rng)

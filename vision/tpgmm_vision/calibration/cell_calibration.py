@@ -235,10 +235,13 @@ class _Task:
         bases = np.tile(np.eye(4), (len(self.bases), 1, 1))
         links, unplaced = problem.placed(problem.nothing)[0], set(range(len(bases)))
 
-        def order(pair: tuple[int, int]) -> tuple[bool, bool, int]:
+        def order(pair: tuple[int, int]) -> tuple[bool, bool, bool, int]:
             i, target = pair[0], n + pair[1]
             unknown = problem.base_of[problem.links[target]] in unplaced
-            return unknown, (i in known) == (target in known), -len(self.views[pair][0])
+            # a target that stands still before the camera says nothing of where either is
+            still = problem.links[i] == problem.links[target]
+            first = (i in known) == (target in known)
+            return unknown, first, bool(still), -len(self.views[pair][0])
 
         while left := [(i, j) for i, j in self.views if not {i, n + j} <= known.keys()]:
             i, j = min(left, key=order)
@@ -370,6 +373,8 @@ class _Task:
             part = adjust(replace(problem, corners=corners), fit.state, fit.noise)
             placed = problem.carried(part.state)
             for (i, j), (postures, poses) in self.views.items():
+                if problem.links[i] == problem.links[n + j]:
+                    continue  # which stand still to one another, no hand among them
                 own = postures[left := postures % FOLDS == fold]
                 away += [*(inverse(placed[own, i] @ poses[left]) @ placed[own, n + j])]
         poses, offsets, _ = problem.split(fit.state)
