@@ -52,12 +52,12 @@ BUDGETS = {
 #: when its budget is reached.
 CEILINGS = {
     "lines of tpgmm_torch": 13860,
-    "lines of tpgmm_datasets": 4775,
+    "lines of tpgmm_datasets": 4780,
     "lines of lerobot_policy_tpgmm": 2045,
     "lines of tpgmm_tools": 2880,
     "lines of tpgmm_vision": 2835,
     "lines of environments and evaluation": 10290,
-    "lines of tests of core, data sets, policy and tools": 19690,
+    "lines of tests of core, data sets, policy and tools": 19700,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,
 }
