@@ -82,6 +82,7 @@ def test_what_the_options_get_wrong_is_said_and_nothing_is_written(recorded, wri
         (["--units", "deg", "--hand", f"hand={CUBE}"], "'hand'"),
         (["--units", "deg", "--hand", f"{HAND}={CUBE}", "--camera", "side"], "'side'"),
         (["--units", "deg", "--hand", f"{HAND}=tag:7:0.04"], "sees tags of"),
+        (["--units", "deg", *2 * ["--hand", f"{HAND}={CUBE}"]], "each target once"),
     ):
         done = run(*arguments, *options)
         assert done.exit_code != 0

@@ -128,7 +128,11 @@ def cell(
     if unknown := [name for name in camera or () if name not in known]:
         raise UnknownNameError("camera", unknown[0], "the cell", known)
     cameras = {name: known[name] for name in camera or known}
-    hands, checks = (dict(map(_target, several or ())) for several in (hand, check))
+    given = [[_target(one) for one in several or ()] for several in (hand, check)]
+    hands, checks = map(dict, given)
+    names = [name for several in given for name, _ in several]
+    if len({*names}) < len(names):
+        raise DataError(f"--hand and --check name each target once, got {names}")
     mounts = {
         name: Mount(target_from(entry, name), name if name in hands else None)
         for name, entry in {**checks, **hands}.items()
