@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -124,12 +125,14 @@ def page(width: int = 800, height: int = 600) -> Iterator[Page]:
             [*command, f"--user-data-dir={profile}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         try:
             with connect(_address(browser, Path(profile)), max_size=None) as connection:
                 yield Page(connection)
         finally:
-            browser.terminate()
+            # it and the processes that it has started, which may be too busy to be asked
+            os.killpg(browser.pid, signal.SIGKILL)
             browser.wait(PATIENCE)
 
 
