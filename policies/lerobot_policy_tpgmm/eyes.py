@@ -51,11 +51,11 @@ def take_over(given: Any, learned: Mapping[str, Any]) -> dict[str, Any]:
     if given in (None, NO_CELL):
         return {**learned, "source": NO_CELL}
     cell = cell_of(given)
-    if told := cell_of(learned).differences(cell):
+    if differences := cell_of(learned).differences(cell):
         log.warning(
             "the policy was learned with another cell: %s. What was wrong with that one is a "
             "part of what it learned: if it misses, track and learn its demonstrations again",
-            "; ".join(told),
+            "; ".join(differences),
         )
     return dict(cell.content)
 

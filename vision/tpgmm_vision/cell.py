@@ -142,26 +142,26 @@ class Cell:
 
     def differences(self, other: Cell) -> list[str]:
         """What is another one in another cell, in words, one for each thing."""
-        told = []
+        found = []
         for kind in ("cameras", "objects", "checks"):
             one, two = getattr(self, kind), getattr(other, kind)
             for name in sorted(one.keys() | two):
                 what = f"{name!r} of the {kind}"
                 if name not in one or name not in two:
-                    told.append(f"{what} is {'missing' if name in one else 'new'}")
+                    found.append(f"{what} is {'missing' if name in one else 'new'}")
                     continue
                 before, after = (cell.content[kind][name] for cell in (self, other))
                 keys = sorted({*before, *after} - {"pose", "report"})
                 if changed := [key for key in keys if before.get(key) != after.get(key)]:
-                    told.append(f"{what} has another {' and '.join(changed)}")
+                    found.append(f"{what} has another {' and '.join(changed)}")
                 if one[name].pose is None or two[name].pose is None:
                     continue
                 step = inverse(one[name].pose) @ two[name].pose
                 moved = 1e3 * float(np.linalg.norm(step[:3, 3]))
                 turned = math.degrees(angle_between(np.eye(4), step))
                 if moved > SAME_PLACE or turned > SAME_ANGLE:
-                    told.append(f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg")
-        return told + [
+                    found.append(f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg")
+        return found + [
             f"joint {name!r} is offset by {math.degrees(shift):+.2f} deg more"
             for name, shift in self.shifts(other).items()
         ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -123,8 +124,9 @@ def estimate_pose(
             ):
                 fit = free
         fit = fit or problem.best(None)
-        if len(problem.tags) == 1 or not problem.contradicts(fit):
-            return problem.judged(fit)
+        wrong = problem.contradicts(fit)
+        if not wrong or len(problem.tags) == 1:
+            return problem.judged(fit, wrong)
         problem = problem.without(problem.worst(fit.pose))
     return None
 
@@ -177,7 +179,7 @@ class _Seen:
         points = transformed(self._from_base @ pose, self.points.reshape(-1, 3))
         return self.view.camera.project(points).reshape(-1, 4, 2) - self.pixels
 
-    @property
+    @cached_property
     def _from_base(self) -> Array:
         return inverse(self.view.base_from_camera)
 
@@ -309,7 +311,7 @@ class _Problem:
         bound = CRAFT * float(np.median(np.concatenate(edges)))
         return fit.cost > MOST_MISFIT**2 * self.freedom and self.residual(fit.pose) > bound
 
-    def judged(self, fit: _Fit) -> PoseEstimate:
+    def judged(self, fit: _Fit, wrong: bool) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
         misfit = fit.cost / self.freedom
         inverse_information = np.linalg.pinv(fit.information, hermitian=True)
@@ -317,7 +319,7 @@ class _Problem:
         position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
                           (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
         reason, alternative = "", None
-        if self.contradicts(fit):
+        if wrong:
             reason = "the corners of its tag fit no pose"
         elif position > MOST_UNCERTAIN[0] or turn > MOST_UNCERTAIN[1]:
             reason = (

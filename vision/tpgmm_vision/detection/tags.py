@@ -258,8 +258,7 @@ class _Fit:
 
     def _blurred(self, step: Array) -> None:
         """Change the blur, within what a picture may have."""
-        new = self.blur + step[[0, 1, 1, 2]].reshape(2, 2)
-        values, axes = np.linalg.eigh(new)
+        values, axes = np.linalg.eigh(self.blur + step[[0, 1, 1, 2]].reshape(2, 2))
         self.blur = axes * np.clip(values, LEAST_BLUR, MOST_BLUR) @ axes.T
 
     def _rates(self, corners: Array) -> Array:
