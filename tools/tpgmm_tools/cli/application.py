@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tpgmm_tools.cli import dataset, demo, plot, plugins, reproduce, view
+from tpgmm_tools.cli import dataset, demo, plot, plugins, report, reproduce, view
 
 __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
-ORDER = ("demo", "fit", "reproduce", "plot", "view", "app", "dataset", "camera", "calibrate")
+ORDER = ("demo", "fit", "reproduce", "report", "plot", "view", "app", "dataset", "camera", "calibrate")
 #: Those that are imported when they run, and their line in ``--help``.
 LATE = {
     "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
@@ -121,7 +121,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (demo, plot, reproduce, view):
+for module in (demo, plot, report, reproduce, view):
     app.registered_commands += module.app.registered_commands
 app.add_typer(dataset.app, name="dataset")
 

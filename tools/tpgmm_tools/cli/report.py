@@ -1,0 +1,83 @@
+"""``tpgmm report``: what is to be known of a model, on one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from tpgmm_tools.cli import options
+
+__all__ = ["app"]
+
+app = typer.Typer()
+
+EXAMPLE = "tpgmm report out/demo/model --dataset out/demo/dataset --out out/report.html"
+
+
+@options.command(app, EXAMPLE)
+def report(
+    model: Path,
+    *,
+    dataset: str,
+    data: options.DataOptions,
+    out: Path | None = None,
+    alignment: options.Alignments = "dtw",
+    situation: int = 0,
+    most: int = 10,
+    object_: list[str] | None = None,
+    meshes: Path | None = None,
+) -> None:
+    """Write one HTML page about a model, for yourself and for those who have to trust it.
+
+    How exactly it reproduces demonstrations that are left out, at events in mm and degrees; which
+    operator decides when; speeds and positions against the robot's limits; how new each
+    demonstration is to the others; the motion in three dimensions.
+
+    Parameters
+    ----------
+    model : ``DIR``
+        A model that 'tpgmm fit' saved.
+    dataset : str
+        The LeRobot data set that it was learned from.
+    out : ``FILE.html``
+        Where the page goes; default DIR.html.
+    alignment : str
+        How episodes are brought onto one clock, as for 'tpgmm fit'.
+    situation : int >= 0
+        The episode whose situation is shown, counted from 0.
+    most : int >= 3
+        Of more episodes, only this number is left out, one after the other.
+    object_ : ``FRAME=SHAPE``
+        What an object looks like, as for 'tpgmm view', repeatable.
+    meshes : ``FOLDER``
+        The robot's mesh files.
+    """
+    import torch
+    from rich.progress import Progress
+
+    from tpgmm_tools.cli.learning import prepared
+    from tpgmm_tools.report import write_report
+    from tpgmm_tools.viewing import parse_shape
+    from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.persistence import load_model
+
+    torch.set_num_threads(1)
+    fitted = load_model(model, device="cpu")
+    robot = fitted.kinematics_
+    shown = options.align(data.read(dataset, robot), alignment, robot)
+    shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
+    if situation >= len(shown):
+        raise DataError(f"there are {len(shown)} episodes, counted from 0: --situation {situation}")
+    pairs = [text.partition("=") for text in object_ or ()]
+    how: dict[str, Any] = {"objects": {n: parse_shape(s) for n, _, s in pairs}, "meshes": meshes}
+    place = out or Path(f"{model}.html")
+    how |= {"situation": situation, "most": most, "title": model.resolve().name}
+    with Progress(transient=True) as bar:
+        task = bar.add_task("leaving one out")
+        write_report(
+            place, fitted, shown, **how,
+            progress=lambda done, of: bar.update(task, completed=done, total=of),
+        )  # fmt: skip
+    typer.echo(f"{place.stat().st_size / 1e6:.1f} MB in {place}")
