@@ -30,6 +30,8 @@ TERM = re.compile(
     r":(?P<link>[^\s:@+~]+)(@(?P<held>held:)?(?P<frame>[^\s:@+~]+))?)"
     r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
 )
+#: What ``pose`` is short for.
+PAIR = re.compile(r"position:([^\s~]+) \+ orientation(\[tangent\])?:\1(?= |$)")
 GRAMMAR = (
     "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
     "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
@@ -112,9 +114,12 @@ def format_operator(operator: Operator) -> str:
     --------
     >>> format_operator(Stack(RelativePosition("l_hand", "bottle"), Canonical()))
     'position:l_hand@bottle + canonical'
+    >>> format_operator(parse_operator("pose:l_hand@bottle"))
+    'pose:l_hand@bottle'
     """
     if isinstance(operator, Stack):
-        return " + ".join(map(format_operator, operator.operators))
+        terms = " + ".join(map(format_operator, operator.operators))
+        return PAIR.sub(r"pose\2:\1", terms)
     one: Any = operator
     if type(operator) is Canonical:
         text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
