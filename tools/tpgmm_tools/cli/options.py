@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from tpgmm_tools.cli.help import HELP_ALL, Command, Help
+
 if TYPE_CHECKING:
     from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -24,6 +26,13 @@ __all__ = [
     "options_of", "wanted",
 ]  # fmt: skip
 
+#: Options that most people need: a command's ``--help`` lists those of them that it has.
+BASIC = (
+    "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components", "alignment",
+    "format_", "dataset", "situations", "situation", "object_", "live", "joint", "cell", "rate",
+    "n_situations", "n_demonstrations", "random_state", "to", "name", "board", "tag", "cube",
+    "size", "hand", "check", "env", "policies", "demonstrations", "seeds", "budget", "conditions",
+)  # fmt: skip
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
@@ -171,7 +180,11 @@ def filter_plausibility(action: str) -> None:
 
 
 def command(
-    app: typer.Typer, example: str, generated: Iterable[Parameter] = ()
+    app: typer.Typer,
+    example: str,
+    generated: Iterable[Parameter] = (),
+    *,
+    basic: Collection[str] = BASIC,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that adds a function to an app as a command.
 
@@ -187,6 +200,8 @@ def command(
         Shown below the help, after "Example: ".
     generated : iterable of inspect.Parameter
         As :func:`options_of` makes them.
+    basic : collection of str
+        Parameters that ``--help`` lists, beside those that are required.
     """
 
     def add(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -204,15 +219,18 @@ def command(
 
         @wraps(function)
         def run(**given: Any) -> Any:
+            given.pop(HELP_ALL.name)
             for name, (group, members) in groups.items():
                 given[name] = group(**{each.name: given.pop(each.name) for each in members})
             return function(**given)
 
         text = (getdoc(function) or "").partition("Parameters\n---")[0]
         run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
+        about = Help(run.__doc__, example, parameters, basic)
+        parameters = [*parameters, HELP_ALL]
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
-        app.command(epilog=f"Example: {example}")(run)
+        app.command(cls=type("Command", (Command,), {"about": about}))(run)
         return function
 
     return add
