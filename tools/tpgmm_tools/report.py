@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from sklearn.base import clone
 
 from tpgmm_tools.hub.model_card import describe
@@ -93,7 +92,9 @@ def leave_one_out(
     """
     count = len(demonstrations)
     if count <= FEWEST:
-        raise DataError(f"to leave one out takes {FEWEST + 1} demonstrations, there are {count}")
+        raise DataError(
+            f"to leave one out takes {FEWEST + 1} demonstrations, there are {count}"
+        )
     chosen = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
     found = []
     for done, index in enumerate(chosen):
@@ -102,7 +103,8 @@ def leave_one_out(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             fitted = clone(model).fit(rest)
-            [trajectory] = fitted.predict([Situation.of(shown)], candidates=False)
+            situation = Situation.of(shown, shown.time)
+            [trajectory] = fitted.predict([situation], candidates=False)
         errors = {}
         for link in fitted.kinematics_.links:
             for event, time in _instants(shown).items():
@@ -247,7 +249,9 @@ def _decides(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
     )
 
 
-def _joints(model: TaskParameterizedGMM, motions: Sequence[Trajectory]) -> tuple[str, list[str]]:
+def _joints(
+    model: TaskParameterizedGMM, motions: Sequence[Trajectory]
+) -> tuple[str, list[str]]:
     """Ranges and speeds of the joints, and sentences about those near their limits."""
     robot, rows, near = model.kinematics_, [], []
     joints = [as_array(one.joints) for one in motions]
@@ -256,7 +260,10 @@ def _joints(model: TaskParameterizedGMM, motions: Sequence[Trajectory]) -> tuple
         for one, motion in zip(joints, motions, strict=True)
     ]
     low, high = (as_array(one) for one in (robot.lower, robot.upper))
-    least, most = np.min([one.min(0) for one in joints], 0), np.max([one.max(0) for one in joints], 0)
+    least, most = (
+        np.min([one.min(0) for one in joints], 0),
+        np.max([one.max(0) for one in joints], 0),
+    )
     fastest, limit = np.max(speeds, axis=0), as_array(robot.velocity)
     for j, name in enumerate(robot.joint_names):
         room = min(least[j] - low[j], high[j] - most[j])
@@ -265,13 +272,17 @@ def _joints(model: TaskParameterizedGMM, motions: Sequence[Trajectory]) -> tuple
         if close:
             near.append(f"{name} comes within {room:.3f} of its limit of position.")
         if fast:
-            near.append(f"{name} moves with {fastest[j]:.2f} of at most {limit[j]:.2f} per second.")
+            near.append(
+                f"{name} moves with {fastest[j]:.2f} of at most {limit[j]:.2f} per second."
+            )
         rows.append([
             name, f"{least[j]:.2f} to {most[j]:.2f}", f"{low[j]:.2f} to {high[j]:.2f}",
             f"{fastest[j]:.2f}", f"{limit[j]:.2f}", "near" if close or fast else "",
         ])  # fmt: skip
     head = ["joint", "moves", "may", "fastest", "limit", ""]
-    return "<p>rad or m, and per second, in all demonstrated situations.</p>" + _table(head, rows), near
+    return "<p>rad or m, and per second, in all demonstrated situations.</p>" + _table(
+        head, rows
+    ), near
 
 
 def _demonstrations(

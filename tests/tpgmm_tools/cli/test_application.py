@@ -13,7 +13,7 @@ from tests.support.command_line import output, refusal, run
 from tpgmm_tools.cli import plugins
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 
-COMMANDS = ["demo", "fit", "reproduce", "plot", "view", "app", "dataset"]
+COMMANDS = ["demo", "fit", "reproduce", "report", "plot", "view", "app", "dataset"]
 DESCRIBE = "tpgmm_datasets.description.describe_lerobot"
 
 
@@ -22,7 +22,7 @@ def test_version_and_help_need_no_command():
     for arguments in ((), ("--help",)):
         text = output(*arguments)
         listed = re.findall(r"^│ (\w+)", text.partition("Commands")[2], re.MULTILINE)
-        assert listed[:7] == COMMANDS
+        assert listed[:8] == COMMANDS
         assert "Run the paper's experiment" in text and "Learn a skill from" in text
 
 
@@ -31,7 +31,12 @@ def test_version_and_help_need_no_command():
     COMMANDS[:-1] + [f"dataset {n}" for n in ("info", "check", "plot", "generate", "convert")],
 )
 def test_the_help_of_every_command_has_an_example(command):
-    assert f"Example: tpgmm {command}" in output(*command.split(), "--help")
+    every = output(*command.split(), "--help-all")
+    text = output(*command.split(), "--help")
+    for lines in (text.splitlines(), every.splitlines()):
+        assert max(map(len, lines)) <= 80
+    assert len(text.splitlines()) <= 40 <= 40 + every.count("--") - text.count("--")
+    assert f"Example: tpgmm {command}" in text and "…" not in text
 
 
 def test_help_needs_none_of_the_heavy_packages():

@@ -54,10 +54,13 @@ def test_options_follow_signature_and_docstring():
     assert run("out", "--frame", "a", "--frame", "b", "--count", "3").exit_code == 0
     assert (given["frames"], given["count"], given["share"]) == (["a", "b"], 3, 0.5)
     assert run("out", "--count", "0").exit_code == 2
-    text = " ".join(run("--help").output.replace("│", " ").split())
+    text = " ".join(run("--help-all").output.split())
     assert "How much, see tpgmm.other. [default: 0.5]" in text
     assert "Of both kinds [m]." in text and "--other" not in text
-    assert "Make one." in text and "{DIR}" in text and "Parameters" not in text
+    assert "Make one." in text and "Usage: made DIR [OPTIONS]" in text
+    assert "Parameters" not in text
+    short = run("--help").output
+    assert "--frame NAME[=SOURCE]" in short and "--share" not in short
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,18 @@ from tpgmm_tools.cli import dataset, demo, plot, plugins, report, reproduce, vie
 __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
-ORDER = ("demo", "fit", "reproduce", "report", "plot", "view", "app", "dataset", "camera", "calibrate")
+ORDER = (
+    "demo",
+    "fit",
+    "reproduce",
+    "report",
+    "plot",
+    "view",
+    "app",
+    "dataset",
+    "camera",
+    "calibrate",
+)
 #: Those that are imported when they run, and their line in ``--help``.
 LATE = {
     "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),

@@ -145,7 +145,7 @@ def _explained(one: Parameter, every: bool) -> str:
 
 def _entry(syntax: str, text: str) -> Iterator[str]:
     """Lines of one parameter: its syntax, never cut, and what it is for beside it."""
-    lines = textwrap.wrap(text, WIDTH - COLUMN, break_long_words=False)
+    lines = textwrap.wrap(text, WIDTH - COLUMN, break_long_words=False) or [""]
     first = f"  {syntax}"
     if len(first) < COLUMN:
         yield first.ljust(COLUMN) + lines[0]

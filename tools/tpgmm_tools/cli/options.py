@@ -28,10 +28,11 @@ __all__ = [
 
 #: Options that most people need: a command's ``--help`` lists those of them that it has.
 BASIC = (
-    "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components", "alignment",
-    "format_", "dataset", "situations", "situation", "object_", "live", "joint", "cell", "rate",
-    "n_situations", "n_demonstrations", "random_state", "to", "name", "board", "tag", "cube",
-    "size", "hand", "check", "env", "policies", "demonstrations", "seeds", "budget", "conditions",
+    "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components",
+    "alignment", "format_", "dataset", "situations", "situation", "object_", "live", "joint",
+    "cell", "rate", "n_situations", "n_demonstrations", "random_state", "to", "name", "board",
+    "tag", "cube", "size", "hand", "check", "env", "policies", "demonstrations", "seeds",
+    "budget", "conditions",
 )  # fmt: skip
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 

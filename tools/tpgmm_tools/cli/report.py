@@ -31,8 +31,8 @@ def report(
 ) -> None:
     """Write one HTML page about a model, for yourself and for those who have to trust it.
 
-    How exactly it reproduces demonstrations that are left out, at events in mm and degrees; which
-    operator decides when; speeds and positions against the robot's limits; how new each
+    How exactly it reproduces demonstrations that are left out, at events in mm and degrees;
+    which operator decides when; speeds and positions against the robot's limits; how new each
     demonstration is to the others; the motion in three dimensions.
 
     Parameters
@@ -55,6 +55,7 @@ def report(
         The robot's mesh files.
     """
     import torch
+    from rich.console import Console
     from rich.progress import Progress
 
     from tpgmm_tools.cli.learning import prepared
@@ -69,12 +70,18 @@ def report(
     shown = options.align(data.read(dataset, robot), alignment, robot)
     shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
     if situation >= len(shown):
-        raise DataError(f"there are {len(shown)} episodes, counted from 0: --situation {situation}")
+        raise DataError(
+            f"there are {len(shown)} episodes, counted from 0: --situation {situation}"
+        )
     pairs = [text.partition("=") for text in object_ or ()]
-    how: dict[str, Any] = {"objects": {n: parse_shape(s) for n, _, s in pairs}, "meshes": meshes}
+    how: dict[str, Any] = {
+        "objects": {n: parse_shape(s) for n, _, s in pairs},
+        "meshes": meshes,
+    }
     place = out or Path(f"{model}.html")
     how |= {"situation": situation, "most": most, "title": model.resolve().name}
-    with Progress(transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("leaving one out")
         write_report(
             place, fitted, shown, **how,

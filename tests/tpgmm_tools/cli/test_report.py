@@ -1,0 +1,76 @@
+"""``tpgmm report``: a page about a model."""
+
+import html
+import re
+
+import pytest
+
+from tests.support import skills
+from tests.support.command_line import output, refusal
+from tpgmm_datasets import save_lerobot
+from tpgmm_tools.report import leave_one_out
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.metrics import pose_errors
+from tpgmm_torch.persistence import save
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A folder with a model and what it was learned from."""
+    folder = tmp_path_factory.mktemp("report")
+    shown = skills.generator().demonstrations(4)
+    model = skills.small_bottle()
+    save(model, folder / "model")
+    save_lerobot(shown, folder / "dataset", fps=20, task="shake")
+    return folder, model, shown
+
+
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_errors_are_those_of_models_that_were_learned_without(learned):
+    _, model, shown = learned
+    found = leave_one_out(model, shown, most=3)
+    assert [one.index for one in found] == [0, 2, 3]
+    one = found[1]
+    alone = TaskParameterizedGMM(**model.get_params(deep=False))
+    alone.fit([shown[0], shown[1], shown[3]])
+    [trajectory] = alone.predict([skills.Situation.of(shown[2], shown[2].time)])
+    error = pose_errors(trajectory, shown[2], alone.kinematics_, "l_hand", "grasp")
+    assert one.errors["l_hand", "grasp"] == pytest.approx(
+        (float(error.position), float(error.angle)), rel=1e-6, abs=1e-9
+    )
+    assert one.novelty == pytest.approx(float(trajectory.novelty))
+
+
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_the_page_has_errors_candidates_limits_and_the_motion(learned):
+    folder, model, _ = learned
+    arguments = "--dataset", folder / "dataset", "--alignment", "none"
+    text = output("report", folder / "model", *arguments)
+    page = (folder / "model.html").read_text(encoding="utf-8")
+    assert text.endswith(f"in {folder / 'model.html'}\n")
+    titles = re.findall("<h2>(.*?)</h2>", page)
+    assert titles[:4] == [
+        "At a glance",
+        "The motion",
+        "How exact it is",
+        "Who decides, and when",
+    ]
+    assert "<td>l_hand<td>grasp<td>" in page
+    for name, speed in zip(
+        model.kinematics_.joint_names, model.kinematics_.velocity, strict=True
+    ):
+        assert re.search(f"<td>{name}<td>.*?<td>{float(speed):.2f}<td>", page)
+    motion = html.unescape(re.search('srcdoc="(.*?)"', page, re.DOTALL)[1])
+    assert "viser" in motion and "<title>" in motion
+    assert "://" not in re.sub('srcdoc=".*?"', "", page, flags=re.DOTALL)
+
+
+def test_what_cannot_be_left_out_is_an_error(learned, tmp_path):
+    folder, _, shown = learned
+    save_lerobot(shown[:2], tmp_path / "two", fps=20, task="shake")
+    assert "to leave one out takes 3 demonstrations, got 2" in refusal(
+        "report", folder / "model", "--dataset", tmp_path / "two", "--alignment", "none"
+    )
+    assert "there are 4 episodes" in refusal(
+        "report", folder / "model", "--dataset", folder / "dataset", "--situation", 7
+    )
