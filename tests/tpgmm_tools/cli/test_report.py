@@ -68,7 +68,7 @@ def test_the_page_has_errors_candidates_limits_and_the_motion(learned):
 def test_what_cannot_be_left_out_is_an_error(learned, tmp_path):
     folder, _, shown = learned
     save_lerobot(shown[:2], tmp_path / "two", fps=20, task="shake")
-    assert "to leave one out takes 3 demonstrations, got 2" in refusal(
+    assert "to leave one out takes 3 demonstrations, there are 2" in refusal(
         "report", folder / "model", "--dataset", tmp_path / "two", "--alignment", "none"
     )
     assert "there are 4 episodes" in refusal(

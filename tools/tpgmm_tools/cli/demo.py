@@ -19,19 +19,23 @@ app = typer.Typer(add_completion=False)
 
 #: Heading, entry of the metrics, figures shown, digits behind the point.
 COLUMNS = (
-    ("grasp\nmm", "grasp position error [mm]", ("median", "p95"), 2),
-    ("grasp\ndeg", "grasp orientation error [deg]", ("median", "p95"), 3),
-    ("shoulder\nRMSE rad", "shoulder RMSE [rad]", ("median", "p95"), 3),
-    ("freq.\n%", "frequency error [%]", ("median", "p95"), 1),
-    ("ampl.\n%", "amplitude error [%]", ("median", "p95"), 1),
-    ("first\nstep", "first step [rad]", ("max",), 3),
-    ("beyond\nlimit", "beyond joint limits [rad]", ("max",), 3),
-    ("speed\nrad/s", "joint speed [rad/s]", ("max",), 2),
-    ("accel.\nrad/s^2", "joint acceleration [rad/s^2]", ("median", "max"), 1),
+    ("grasp\n[mm]", "grasp position error [mm]", ("median", "p95"), 2),
+    ("grasp\n[deg]", "grasp orientation error [deg]", ("median", "p95"), 3),
+    ("shaking\n[rad]", "shoulder RMSE [rad]", ("median", "p95"), 3),
+    ("amplitude\n[%]", "amplitude error [%]", ("median", "p95"), 1),
 )
-CAPTION = (
-    "median/95th percentile; first step and limits (rad) and speed: worst; accel.: median/worst"
+TITLE = "How far off: median / 95th percentile over situations that were not demonstrated"
+#: Names of the methods for those who have not read the paper.
+NAMES = (
+    ("information form, ", "TP-GMM, "),
+    ("covariance form, epsilon = ", "eqs (1), (2), "),
+    ("position only", "without orientation"),
 )
+NEXT = """
+Next: see it move, read one page about it, learn your own skill
+  tpgmm view {out}
+  tpgmm report {out}/model --dataset {out}/dataset
+  tpgmm fit RECORDINGS --robot ROBOT.urdf --out MODEL"""
 ORIENTATION = "grasp orientation error [deg]"
 
 
@@ -68,53 +72,61 @@ def demo(
     """
     import torch
     from rich.console import Console
+    from rich.progress import Progress
 
     from tpgmm_datasets.bottle.experiment import BottleExperiment
     from tpgmm_datasets.bottle.skill import BottleShaking
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    metrics = BottleExperiment(
-        out,
-        n_components=n_components,
-        n_demonstrations=n_demonstrations,
-        n_situations=n_situations,
-        seed=random_state,
-        report=lambda text: typer.echo(f"{text} ..."),
-        skill=BottleShaking(rate=rate),
-    ).run()
-    shown = table(metrics["rows"], metrics["demonstrations"])
-    Console(width=max(Console().width, 100)).print(shown)
+    console = Console(width=max(Console().width, 80))
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=BottleExperiment.STAGES)
+
+        def report(text: str) -> None:
+            bar.update(task, description=text, advance=1)
+            if not console.is_terminal:
+                typer.echo(f"{text} ...")
+
+        metrics = BottleExperiment(
+            out,
+            n_components=n_components,
+            n_demonstrations=n_demonstrations,
+            n_situations=n_situations,
+            seed=random_state,
+            report=report,
+            skill=BottleShaking(rate=rate),
+        ).run()
+    console.print(table(metrics["rows"]))
     for line in summary(metrics):
         typer.echo(line)
     typer.echo(
-        f"seed {random_state}, {metrics['seconds']:.0f} s; "
-        f"data set, model, figures and metrics.json in {out}"
+        f"\nData set, model, figures and metrics.json are in {out} "
+        f"(seed {random_state}, {metrics['seconds']:.0f} s)."
     )
+    typer.echo(NEXT.format(out=out))
 
 
-def table(rows: Mapping[str, Mapping[str, Any]], demonstrations: Mapping[str, Any]) -> Table:
-    """The metrics as a table of at most 100 columns.
+def table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
+    """The metrics as a table of at most 80 columns.
 
     Parameters
     ----------
     rows : mapping of str to mapping
         By name of the method, ``metrics["rows"]``.
-    demonstrations : mapping
-        The demonstrations' own, ``metrics["demonstrations"]``.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    shown = Table(
-        box=SIMPLE_HEAD, padding=0, pad_edge=False, caption=CAPTION, caption_justify="left"
-    )
-    shown.add_column("", no_wrap=True)
+    shown = Table(box=SIMPLE_HEAD, pad_edge=False, title=TITLE, title_justify="left")
+    shown.add_column("")
     for heading, *_ in COLUMNS:
-        shown.add_column(heading, justify="right", no_wrap=True)
-    for name, row in {**rows, "demonstrations": demonstrations}.items():
+        shown.add_column(heading, justify="right")
+    for number, (name, row) in enumerate(rows.items()):
         cells = [_cell(row.get(key), parts, digits) for _, key, parts, digits in COLUMNS]
-        shown.add_row(name.replace(", ", ",\n"), *cells)
+        for stored, label in NAMES:
+            name = name.replace(stored, label)
+        shown.add_row(name, *cells, style="bold" if number == 0 else "")
     return shown
 
 
@@ -122,22 +134,21 @@ def _cell(value: Any, parts: tuple[str, ...], digits: int) -> str:
     if value is None:
         return "-"
     numbers = [value[part] for part in parts] if isinstance(value, Mapping) else [value]
-    return "/".join(f"{number:.{digits if number < 10 else 0}f}" for number in numbers)
+    return " / ".join(f"{number:.{digits if number < 10 else 0}f}" for number in numbers)
 
 
 def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
-    """Shares, ratios and alignment, in sentences.
+    """What the numbers say, in sentences.
 
     Parameters
     ----------
     metrics : mapping
         As the experiment returns them.
     """
-    for name, share in metrics["share of information on the shoulders"].items():
-        yield f"share of the information on the shoulders, {name}: {100 * share:.1f} %"
-    full, ablated = next(iter(metrics["rows"].values())), metrics["rows"]["position only"]
-    ratio = ablated[ORIENTATION]["median"] / full[ORIENTATION]["median"]
-    yield f"orientation error at the grasp if positions alone are learned: {ratio:.3g} times"
-    for name, measures in metrics["alignment"].items():
-        figures = ", ".join(f"{measure} {value:.3g}" for measure, value in measures.items())
-        yield f"alignment, {name}: {figures}"
+    shares = list(metrics["share of information on the shoulders"].values())
+    yield (
+        f"Before the grasp {100 * shares[0]:.0f} % of what is known about the shoulders comes "
+        f"from the bottle,\nwhile shaking {100 * shares[1]:.0f} % from the joints."
+    )
+    ablated = metrics["rows"]["position only"][ORIENTATION]["median"]
+    yield f"If orientations are not learned, the hands are turned by {ablated:.1f} deg at the grasp."
