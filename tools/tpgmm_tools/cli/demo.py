@@ -19,10 +19,10 @@ app = typer.Typer(add_completion=False)
 
 #: Heading, entry of the metrics, figures shown, digits behind the point.
 COLUMNS = (
-    ("grasp\n[mm]", "grasp position error [mm]", ("median", "p95"), 2),
-    ("grasp\n[deg]", "grasp orientation error [deg]", ("median", "p95"), 3),
-    ("shaking\n[rad]", "shoulder RMSE [rad]", ("median", "p95"), 3),
-    ("amplitude\n[%]", "amplitude error [%]", ("median", "p95"), 1),
+    ("grasp\nin mm", "grasp position error [mm]", ("median", "p95"), 2),
+    ("grasp\nin deg", "grasp orientation error [deg]", ("median", "p95"), 3),
+    ("shaking\nin rad", "shoulder RMSE [rad]", ("median", "p95"), 3),
+    ("amplitude\nin %", "amplitude error [%]", ("median", "p95"), 1),
 )
 TITLE = "How far off: median / 95th percentile over situations that were not demonstrated"
 #: Names of the methods for those who have not read the paper.
@@ -151,4 +151,4 @@ def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
         f"from the bottle,\nwhile shaking {100 * shares[1]:.0f} % from the joints."
     )
     ablated = metrics["rows"]["position only"][ORIENTATION]["median"]
-    yield f"If orientations are not learned, the hands are turned by {ablated:.1f} deg at the grasp."
+    yield f"Without orientations the hands are turned by {ablated:.1f} deg at the grasp."
