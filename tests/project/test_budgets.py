@@ -55,7 +55,7 @@ CEILINGS = {
     "lines of tpgmm_datasets": 4780,
     "lines of lerobot_policy_tpgmm": 2045,
     "lines of tpgmm_tools": 2880,
-    "lines of tpgmm_vision": 2835,
+    "lines of tpgmm_vision": 2845,
     "lines of environments and evaluation": 10290,
     "lines of tests of core, data sets, policy and tools": 19700,
     "longest function of the core": 81,
