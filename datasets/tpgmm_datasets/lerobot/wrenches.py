@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +28,7 @@ def stored_wrenches(rows: EpisodeRows) -> dict[str, Tensor]:
         Read with :func:`wrench_features`.
     """
     return {
-        key.removeprefix(WRENCH): torch.from_numpy(values).double()
+        key.removeprefix(WRENCH): torch.from_numpy(values.astype(np.float64))
         for key, values in rows.values.items()
         if key.startswith(WRENCH)
     }

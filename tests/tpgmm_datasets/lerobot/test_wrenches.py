@@ -6,7 +6,7 @@ import torch
 
 from tests.support.pressing import LEAVE, TOUCH, slides, wipes
 from tpgmm_datasets import load_lerobot, resample, save_lerobot, trim
-from tpgmm_datasets.events import find_events
+from tpgmm_datasets.events import find_events, parse_event
 from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
 from tpgmm_torch import Demonstration
 from tpgmm_torch.alignment import DynamicTimeWarping
@@ -43,7 +43,9 @@ def test_other_rates_and_clocks_take_them_along():
 
 
 def test_contact_and_release_are_found_in_a_wrench():
-    for one in find_events(wipes(), {"touch": "contact:hand", "leave": "release:hand"}):
+    events = {"touch": "contact:hand", "leave": "release:hand"}
+    detectors = {name: parse_event(text) for name, text in events.items()}
+    for one in find_events(wipes(), detectors):
         assert one.event("touch") == pytest.approx(TOUCH, abs=0.03)
         assert one.event("leave") == pytest.approx(LEAVE, abs=0.03)
 
