@@ -30,7 +30,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("checks", "metrics", "motion", "sensing"),
         ("training",),
         ("regression",),
-        ("events", "skills"),
+        ("contact", "events", "skills"),
         ("control",),
         ("estimator",),
         ("corrections", "persistence", "structure"),

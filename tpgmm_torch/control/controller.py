@@ -10,6 +10,8 @@ locate
     :mod:`~tpgmm_torch.sensing.servo`, :mod:`~tpgmm_torch.control.places`)
 hold
     objects that move with a hand (:mod:`~tpgmm_torch.control.hold`)
+touch
+    links that move by the error of their forces (:mod:`~tpgmm_torch.contact.admittance`)
 estimate
     the Gaussian of the joints (:mod:`~tpgmm_torch.control.estimate`)
 reach
@@ -46,6 +48,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import START
+from tpgmm_torch.contact.admittance import Admittance, Offsets
 from tpgmm_torch.control import command as commands
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.control.command import Command
@@ -69,6 +72,7 @@ from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.servo import Flags
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.sensing.wrenches import Wrenches
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]
@@ -146,6 +150,10 @@ class Controller:
         What q_{t-1} is: the last reference, or the measured posture.
     impedance : Impedance, optional
         Stiffness and damping of the commands.
+    admittance : Admittance, optional
+        How references move by the error of forces, where the skill has operators
+        :class:`~tpgmm_torch.operators.Wrench` and steps are given wrenches; None to follow
+        positions alone.
     begin, end : float, optional
         Run a part of the skill [s].
     at_rest : bool
@@ -176,6 +184,7 @@ class Controller:
         blend: float = 1.0,
         feedback: str = "reference",
         impedance: Impedance | None = None,
+        admittance: Admittance | None = Admittance(),  # noqa: B008  (frozen)
         begin: float | None = None,
         end: float | None = None,
         at_rest: bool = True,
@@ -200,6 +209,8 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
+        self._wrenches, forces = _expected_contacts(skill, start, begin)
+        self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
         bounds = _motion_bounds(skill, bounds)
@@ -233,6 +244,13 @@ class Controller:
         return self._holds.holding
 
     @property
+    def contacts(self) -> dict[str, Tensor]:
+        """Which robots are in contact (...), by links whose wrench was given."""
+        device = self.reference.device
+        readings = self._wrenches.readings.items()
+        return {link: torch.from_numpy(one.contact).to(device) for link, one in readings}
+
+    @property
     def time(self) -> Tensor:
         """Progress at the last step [s], the same () for all robots or of each one (...)."""
         time, even = self._progress.time, self._progress.clock.kind == "even"
@@ -254,6 +272,7 @@ class Controller:
         *,
         holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
+        wrenches: Mapping[str, Any] | None = None,
     ) -> Command:
         """Find the next reference.
 
@@ -274,6 +293,10 @@ class Controller:
         ages : mapping of str to float, optional
             How old ``"joints"`` and the frames are [s]; infinite for what else holds robots,
             a reason in words.
+        wrenches : mapping of str to array-like of shape (..., 6), optional
+            Measured forces [N] and moments [N m] that links exert, at their origins, in the
+            base frame, without the weight of the tool. One that was given once is expected
+            at each step; while it is missing, or not finite, its link moves no further.
 
         Returns
         -------
@@ -283,22 +306,26 @@ class Controller:
         ------
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
+        UnknownNameError
+            If wrenches are those of links that the robot does not have.
 
         Warns
         -----
         PlausibilityWarning
-            If ``dt`` is more than a second, with ``trust``.
+            With ``trust``, if ``dt`` is more than a second, or the first step has no wrench of
+            a skill that expects forces.
         """
         tick = self._timed(dt)
         if tick is None:
             assert self.command is not None
             self.command = commands.refused(self.command, f"{NOT_INCREASED}: dt = {dt!r}")
             return self.command
-        self._sense(tick, joints, frames, ages)
+        self._sense(tick, joints, frames, self._touched(tick, wrenches, ages))
         self._locate(tick)
         tick.time = self.time
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
+            self._touch(tick)
             self._follow(tick, *self._reach(tick, self._estimate(tick)))
         else:
             assert self.command is not None
@@ -369,6 +396,16 @@ class Controller:
             measured = torch.where(self._gripping, torch.nan, measured)
         tick.joints = measured
 
+    def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
+        """Measured wrenches; ages of inputs, with those that are missing too long."""
+        if tick.first and self._trusts and self._offsets is not None and not wrenches:
+            warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
+        self._wrenches = self._wrenches.update(tick.seconds, wrenches)
+        if self._inputs is None:
+            return ages
+        late = self._wrenches.late(self._inputs.trust.joint_timeout)
+        return {**ages, **late} if isinstance(ages, Mapping) and late else late or ages
+
     def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
         assert self._inputs is not None
@@ -432,9 +469,25 @@ class Controller:
         stands, seconds = self._postures(tick, measured=True), _each(tick.seconds)
         self._holds = self._holds.advance(tick.time, stands, seen, holds, seconds, self._inputs)
 
+    def _touch(self, tick: _Tick) -> None:
+        """How far links are moved by the errors of their forces."""
+        if self._offsets is None or not self._wrenches.readings:
+            return
+        state = self._skill.kinematics.state(self._postures(tick, measured=True))
+        passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
+        passed = passed.expand(self.reference.shape[:-1])
+        for robots in (tick.halted, tick.late):
+            if robots is not None:
+                passed = torch.where(self._tensor(robots), 0.0, passed)
+        self._offsets = self._offsets.advance(
+            self._skill.expected_forces(tick.time), self._wrenches, state,
+            self.holding.frames, passed,
+        )  # fmt: skip
+
     def _estimate(self, tick: _Tick) -> Estimate:
         """What the skill says."""
-        at = self._postures(tick, self._feedback == "measured")
+        at: Any = self._postures(tick, self._feedback == "measured")
+        at = self._state(at) if self._is_changed else at
         last = self.command.estimate if self.command is not None and self._trusts else None
         found = estimate(self._skill, tick.time, at, self.holding, self._limits, last)
         self._skill = self._skill.advance(found)
@@ -470,7 +523,7 @@ class Controller:
         joints, self._search = nearest(
             search, follower, wanted, tick.seconds, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
-            found, self._limits, self._state if self.holding.carries else None,
+            found, self._limits, self._state if self._is_changed else None,
             not self._trusts,
         )  # fmt: skip
         return self._rounded(joints, shift), None
@@ -545,9 +598,17 @@ class Controller:
             return self.reference
         return torch.where(tick.joints.isnan(), self.reference, tick.joints)
 
+    @property
+    def _is_changed(self) -> bool:
+        """Whether there is more to a state than the kinematics say."""
+        return self.holding.carries or (self._offsets is not None and self._offsets.active)
+
     def _state(self, joints: Tensor) -> RobotState:
-        """With the objects that the robots hold."""
-        return self.holding.state(self._skill.kinematics.state(joints))
+        """With the objects that the robots hold, and the offsets of links in contact."""
+        state = self._skill.kinematics.state(joints)
+        if self._offsets is not None:
+            state = self._offsets.displaced(state, self.holding.frames)
+        return self.holding.state(state)
 
     def _rounded(self, joints: Tensor, shift: Tensor | None) -> Tensor:
         """Wanted postures; where there are bounds, on a grid."""
@@ -576,6 +637,12 @@ LONG_TICK = (
 )
 
 
+NO_WRENCH = (
+    "the skill expects forces, and the first step has no wrench: references follow positions "
+    "alone. Give step(..., wrenches={link: ...}), or Controller(..., admittance=None)"
+)
+
+
 def _novelty(
     summary: Any, start: Tensor, first: Mapping[str, Frame], now: Mapping[str, Frame]
 ) -> Tensor:
@@ -597,6 +664,14 @@ def _rows(array: Array) -> Array:
 
 def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
+
+
+def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> tuple[Wrenches, bool]:
+    """Readings of wrenches before the first, and whether the skill expects forces."""
+    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+    thresholds = {operator.link: operator.contact for operator in forces}
+    wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), thresholds)
+    return wrenches, bool(forces)
 
 
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.operators.wrench import ExpectedForce
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -106,6 +107,16 @@ class Skill(Protocol):
             If frames are missing or do not fit the robots, or there is no finite estimate.
         """
         ...
+
+    def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
+        """Forces that links exert at a time; none by default.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+            In the skill, for all robots or of each one [s].
+        """
+        return ()
 
     def log_likelihood(
         self,
@@ -276,6 +287,18 @@ class CompositeSkill(Skill):
         )
         mean, covariance = gaussians.moment_match(shares[..., active], means, covariances)
         return Estimate(mean, covariance, shares, after=after)
+
+    def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
+        """See :meth:`Skill.expected_forces`; of one operator, the mean of the skills."""
+        time = time.to(self.kinematics.lower)
+        shares, found = self.shares(time), dict[Any, ExpectedForce]()
+        for k, skill in enumerate(self.skills):
+            weight = shares[..., k]
+            for one in skill.expected_forces(self.time_of(k, time)):
+                part = one.scaled(weight)
+                before = found.get(one.operator)
+                found[one.operator] = part if before is None else before.plus(part)
+        return tuple(found.values())
 
     def log_likelihood(
         self,
