@@ -2,72 +2,309 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
+from pathlib import PurePath
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.skills.gate import CONDITIONS, CONTACT, SWITCH, Condition, Gate
 from tpgmm_torch.skills.skill import CompositeSkill, Skill
 
 __all__ = ["Sequence"]
+
+#: Default of ``fade``: between parts of one demonstration, and between separate skills [s].
+PARTS_FADE, SKILLS_FADE = 0.2, 1.0
+PART = re.compile(
+    r"(?P<name>\S+)(?:\s+until\s+(?P<until>\S+))?(?:\s+within\s+(?P<timeout>\S+))?"
+    r"(?:\s+retry\s+(?P<retry>\d+)(?:\s+from\s+(?P<back>\S+))?)?"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Sequence(CompositeSkill):
     """Skills one after the other, mixed where one ends and the next begins.
 
+    A skill that begins where the one before ends shares its clock, as parts of one
+    demonstration do. Any other was learned separately: it begins ``fade`` seconds after the
+    end of the one before, in which the robot goes to its beginning, with the objects where
+    they are at that end.
+
     Parameters
     ----------
     skills : sequence of Skill
-        Of one robot, each beginning where the one before ends [s].
-    fade : float, default=0.2
-        Seconds around a seam in which the estimates of both neighbours are mixed, by a
-        minimum-jerk share.
+        Of one robot.
+    fade : float, optional
+        Seconds around a seam of parts in which the estimates of both are mixed, by a
+        minimum-jerk share, and between separate skills; by default 0.2, and 1.0 if there are
+        separate ones.
+    until : str, callable, or sequence, default=()
+        What has to be the case at the end of each skill for the next one to begin; one for
+        all, or one of each: None, a condition, or several (in text joined by ``+``).
+        ``"arrived"``: the joints are where the reference is, at rest; ``"held"``: each object
+        that the skill ends holding has moved along with its hand; ``"free"``: each object that
+        it let go has not; ``"contact:LINK"``; or a function of a
+        :class:`~tpgmm_torch.control.gates.Moment` that gives a bool, or one of each robot.
+    retry : int or sequence, default=0
+        How often it is tried again if that is not the case in time, one number for all skills,
+        or one of each; a pair ``(number, skill)`` says from the beginning of which skill, by
+        name or index, by default the one that failed. Then the robot holds.
+    timeout : float or sequence of float, default=2.0
+        How long it is waited for [s].
+    names : sequence of str, default=()
+        Of the skills; by default their numbers.
 
     Raises
     ------
-    DataError
-        If there is none, they are of different robots, or leave gaps.
+    DataError, UnknownNameError
+        If there is no skill, they are of different robots, or conditions do not fit them.
+
+    Examples
+    --------
+    >>> Sequence([pick, place], until=["held", "arrived"], retry=[2, 0])  # doctest: +SKIP
     """
 
     skills: tuple[Skill, ...]
-    fade: float = 0.2
+    fade: float | None = None
+    until: tuple[tuple[Any, ...], ...] = ()
+    retry: tuple[tuple[int, int], ...] = ()
+    timeout: tuple[float, ...] = ()
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "skills", tuple(self.skills))
-        if not self.skills or not self.fade > 0:
+        skills = tuple(self.skills)
+        names = tuple(self.names) or tuple(str(k) for k in range(len(skills)))
+        self._set(skills=skills, names=names)
+        if not skills or not (self.fade is None or 0 < self.fade < math.inf):
             raise DataError(f"a sequence has skills and a positive fade, got {self!r}")
-        for one, other in pairwise(self.skills):
+        if len(names) != len(skills) or len(set(names)) < len(names):
+            raise DataError(f"{len(skills)} skills need a name each, got {list(names)}")
+        for one, other in pairwise(skills):
             if one.kinematics.joint_names != other.kinematics.joint_names:
                 raise DataError("the skills of a sequence are of different robots")
-            if abs(one.end - other.begin) > self.fade:
+            gap, late = abs(other.begin - one.end), abs(other.begin - one.begin)
+            if (self.fade or PARTS_FADE) < gap < late:
                 raise DataError(
                     f"a skill that begins at {other.begin:.4g} s cannot follow one that ends "
-                    f"at {one.end:.4g} s: each begins where the one before ends"
+                    f"at {one.end:.4g} s: on one clock each begins where the one before ends, "
+                    "and those learned separately each begin at the beginning"
                 )
+        parts = all(_shares_clock(one, other, PARTS_FADE) for one, other in pairwise(skills))
+        self._set(fade=self.fade or (PARTS_FADE if parts else SKILLS_FADE))
+        untils, retries, timeouts = (
+            _of_each(value, len(skills), what)
+            for value, what in (
+                (self.until or None, "until"), (self.retry or 0, "retry"),
+                (self.timeout or 2.0, "timeout"),
+            )
+        )  # fmt: skip
+        self._set(
+            until=tuple(self._conditions(*each) for each in zip(skills, untils, strict=True)),
+            retry=tuple(self._retry(k, each) for k, each in enumerate(retries)),
+            timeout=tuple(map(_positive, timeouts)),
+        )
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def parse(
+        cls,
+        text: str,
+        skills: Mapping[str, Skill] | Callable[[str], Skill],
+        fade: float | None = None,
+    ) -> Self:
+        """A sequence from one line of text.
+
+        Parameters
+        ----------
+        text : str
+            Skills, separated by commas, each ``NAME [until CONDITION[+CONDITION]] [within
+            SECONDS] [retry NUMBER [from NAME]]``.
+        skills : mapping of str to Skill, or callable
+            What the names stand for. Of a path the last part is the name.
+        fade : float, optional
+
+        Raises
+        ------
+        DataError, UnknownNameError
+            If a part is not of this form, a name is not known, or as of the sequence.
+        """
+        given = []
+        for part in text.split(","):
+            match = PART.fullmatch(part.strip())
+            if match is None:
+                raise DataError(
+                    f"{part.strip()!r} in {text!r} is not of the form NAME [until CONDITION] "
+                    "[within SECONDS] [retry NUMBER [from NAME]]"
+                )
+            given.append(match)
+        found = []
+        for each in given:
+            if isinstance(skills, Mapping) and each["name"] not in skills:
+                raise UnknownNameError("skill", each["name"], "the sequence", skills)
+            called = skills.__getitem__ if isinstance(skills, Mapping) else skills
+            found.append(called(each["name"]))
+        retry = [(int(one["retry"] or 0), one["back"] or k) for k, one in enumerate(given)]
+        return cls(
+            tuple(found),
+            fade,
+            until=tuple(one["until"] for one in given),
+            retry=tuple(retry),  # type: ignore[arg-type]
+            timeout=tuple(one["timeout"] or 2.0 for one in given),  # type: ignore[misc]
+            names=tuple(PurePath(one["name"]).name for one in given),
+        )
+
+    def _conditions(self, skill: Skill, given: Any) -> tuple[Condition, ...]:
+        """Conditions at the end of a skill, checked."""
+        several = given if isinstance(given, tuple | list) else [given]
+        found: tuple[Condition, ...] = ()
+        for one in filter(None, several):
+            found += tuple(map(str.strip, one.split("+"))) if isinstance(one, str) else (one,)
+        links = skill.kinematics.links
+        for one in found:
+            if isinstance(one, str) and one.startswith(CONTACT):
+                if (link := one.removeprefix(CONTACT)) not in links:
+                    raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
+            elif not callable(one) and one not in CONDITIONS:
+                raise DataError(
+                    f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, "
+                    f"got {one!r}"
+                )
+        for one, holds in (("held", _held(skill)), ("free", _freed(skill))):
+            if one in found and not holds:
+                raise DataError(
+                    f"until {one!r}: the skill ends without an object that is {one} by then; "
+                    f"its holds are {[str(hold) for hold in skill.holds]}"
+                )
+        return found
+
+    def _retry(self, number: int, given: Any) -> tuple[int, int]:
+        """How often, and from which skill on."""
+        times, back = given if isinstance(given, tuple | list) else (given, number)
+        if isinstance(back, str):
+            if back not in self.names:
+                raise UnknownNameError("skill", back, "the sequence", self.names)
+            back = self.names.index(back)
+        if not (isinstance(times, int) and isinstance(back, int) and 0 <= times):
+            raise DataError(f"retry is a number, or a pair (number, skill), got {given!r}")
+        if not 0 <= back <= number:
+            raise DataError(
+                f"{self.names[number]!r} is tried again from itself or a skill before it, "
+                f"got retry={given!r}"
+            )
+        return times, back
+
+    @cached_property
+    def _shifts(self) -> tuple[float, ...]:
+        """What is added to the time of each skill [s]."""
+        assert self.fade is not None
+        shifts = [0.0]
+        for one, other in pairwise(self.skills):
+            shared = _shares_clock(one, other, self.fade)
+            shifts.append(shifts[-1] + (0.0 if shared else one.end + self.fade - other.begin))
+        return tuple(shifts)
+
+    @cached_property
+    def _separate(self) -> tuple[bool, ...]:
+        """Which of the skills but the first do not share the clock of the one before."""
+        return tuple(one != other for one, other in pairwise(self._shifts))
+
+    @cached_property
+    def _stretches(self) -> tuple[tuple[float, float], ...]:
+        """When each skill is alone [s]."""
+        assert self.fade is not None
+        begins, ends = [self.begin], []
+        for one, by, separate in zip(self.skills, self._shifts, self._separate, strict=False):
+            ends.append(one.end + by - (0.0 if separate else self.fade / 2))
+            begins.append(ends[-1] + self.fade)
+        return tuple(zip(begins, [*ends, self.end], strict=True))
 
     @property
     def end(self) -> float:
         """See :attr:`Skill.end`."""
-        return self.skills[-1].end
+        return self.skills[-1].end + self._shifts[-1]
 
     @cached_property
     def time(self) -> Tensor:
         """See :attr:`Skill.time`."""
-        return torch.cat([one.time for one in self.skills]).unique()
+        assert self.fade is not None
+        grids = [
+            one.time + by if by else one.time
+            for one, by in zip(self.skills, self._shifts, strict=True)
+        ]
+        for one, separate, (_, stop) in zip(
+            self.skills, self._separate, self._stretches, strict=False
+        ):
+            if separate:
+                step = (one.end - one.begin) / max(len(one.time) - 1, 1)
+                count = max(round(self.fade / step), 1) + 1
+                grids.append(torch.linspace(stop, stop + self.fade, count)[1:-1].to(one.time))
+        return torch.cat(grids).unique()
+
+    def time_of(self, index: int, time: Tensor) -> Tensor:
+        """A time of the sequence, on the clock of one of its skills."""
+        one, by = self.skills[index], self._shifts[index]
+        time = time - by if by else time
+        before, after = (False, *self._separate, False)[index : index + 2]
+        if not (before or after):
+            return time
+        return time.clamp(one.begin if before else None, one.end if after else None)
+
+    @cached_property
+    def holds(self) -> tuple[Hold, ...]:
+        """See :attr:`Skill.holds`; what a skill ends holding is held until another lets go."""
+        if not any(self._separate):
+            every = dict.fromkeys(hold for one in self.skills for hold in one.holds)
+            return tuple(sorted(every, key=lambda hold: (hold.begin, hold.end)))
+        found: dict[str, list[Hold]] = {}
+        spans = zip(self.skills, self._shifts, self._edges, strict=True)
+        for one, by, (begin, end) in spans:
+            own = [hold.retimed(lambda at, by=by: at + by) for hold in one.holds]  # type: ignore[misc]
+            for hold in sorted(own, key=lambda hold: hold.begin):
+                several = found.setdefault(hold.frame, [])
+                last = several[-1] if several else None
+                early = max(hold.begin, begin)
+                if last is not None and last.end > early:  # from a skill before
+                    several[-1] = replace(last, end=early)
+                    if last.link == hold.link:
+                        early = several.pop().begin
+                several.append(replace(hold, begin=early, end=_open(hold.end, end)))
+        return tuple(sorted((h for each in found.values() for h in each), key=lambda h: h.begin))
 
     @property
-    def holds(self) -> tuple[Hold, ...]:
-        """See :attr:`Skill.holds`."""
-        every = dict.fromkeys(hold for one in self.skills for hold in one.holds)
-        return tuple(sorted(every, key=lambda hold: (hold.begin, hold.end)))
+    def _edges(self) -> list[tuple[float, float]]:
+        """From when to when what a skill holds counts [s]: its beginning, the next one's."""
+        begins = [begin for begin, _ in self._stretches]
+        return list(zip(begins, [*begins[1:], math.inf], strict=True))
+
+    @cached_property
+    def gates(self) -> tuple[Gate, ...]:
+        """See :attr:`Skill.gates`: ends of skills at which something is waited for."""
+        assert self.fade is not None
+        gates: list[Gate] = []
+        separate = (*self._separate, False)
+        for k, (one, name) in enumerate(zip(self.skills, self.names, strict=True)):
+            by, (times, back) = self._shifts[k], self.retry[k]
+            inner = [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
+            own = Gate(
+                self._stretches[k][1], self.until[k], self.timeout[k], times,
+                self._stretches[back][0], separate[k] * self.fade, _held(one), _freed(one), name,
+            )  # fmt: skip
+            gates += [*inner, own] if self.until[k] or separate[k] else inner
+        return tuple(gates)
 
     @cached_property
     def peaks(self) -> tuple[Tensor, Tensor] | None:
@@ -101,8 +338,18 @@ class Sequence(CompositeSkill):
 
     def shares(self, time: Tensor) -> Tensor:
         """Shares (..., n_skills) of the skills at times (...); their sum is 1."""
-        seams = time.new_tensor([one.end for one in self.skills[:-1]])
-        passed = minimum_jerk((time.unsqueeze(-1) - seams) / self.fade + 0.5)
+        assert self.fade is not None
+        fades: float | Tensor = self.fade
+        seams = [one.end + by for one, by in zip(self.skills[:-1], self._shifts, strict=False)]
+        if any(self._separate):  # these begin at once, and the difference fades as it is then
+            widths = [self.fade * (SWITCH if own else 1.0) for own in self._separate]
+            seams = [
+                at + own * width / 2
+                for at, own, width in zip(seams, self._separate, widths, strict=True)
+            ]
+            fades = time.new_tensor(widths)
+        passed = (time.unsqueeze(-1) - time.new_tensor(seams)) / fades
+        passed = minimum_jerk(passed + 0.5)
         one = passed.new_ones(*passed.shape[:-1], 1)
         return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
 
@@ -115,3 +362,44 @@ class Sequence(CompositeSkill):
         several = [one.observed(names) for one in self.skills]
         known = tuple(one for one in several if one is not None)
         return self.with_skills(known) if len(known) == len(several) else None
+
+
+def _shares_clock(one: Skill, other: Skill, fade: float) -> bool:
+    """Whether a skill begins where the other ends, and not where that begins."""
+    return abs(other.begin - one.end) <= min(fade, (one.end - one.begin) / 2)
+
+
+def _held(skill: Skill) -> tuple[Hold, ...]:
+    """What a skill holds when it ends."""
+    return tuple(hold for hold in skill.holds if hold.begin < skill.end <= hold.end)
+
+
+def _freed(skill: Skill) -> tuple[Hold, ...]:
+    """What a skill has let go when it ends."""
+    kept = {hold.frame for hold in _held(skill)}
+    last = {hold.frame: hold for hold in skill.holds if hold.frame not in kept}
+    return tuple(last.values())
+
+
+def _open(end: float, edge: float) -> float:
+    """The end of a hold that lasts to the end of its skill, or beyond."""
+    return end if end < edge else math.inf
+
+
+def _of_each(value: Any, count: int, what: str) -> list[Any]:
+    """A value of each skill."""
+    if not isinstance(value, tuple | list):
+        return [value] * count
+    if len(value) != count:
+        raise DataError(f"{what} has {len(value)} entries for {count} skills: {value!r}")
+    return list(value)
+
+
+def _positive(value: Any) -> float:
+    try:
+        seconds = float(value)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise DataError(f"timeout is a positive number of seconds, got {value!r}")
+    return seconds

@@ -73,6 +73,6 @@ def test_parts_that_do_not_follow_are_refused():
         fit_parts(canonical(n_components=1), shown, [1.0])
     with pytest.raises(DataError, match="operators for 1 of 2 parts"):
         fit_parts(model, shown, [1.0], [[Canonical()]])
-    early, late = fit_parts(model, shown, [1.0]).skills
+    early, _, late = fit_parts(model, shown, [0.7, 1.4]).skills
     with pytest.raises(DataError, match="cannot follow"):
-        Sequence((late, early))
+        Sequence((early, late))
