@@ -307,8 +307,8 @@ def _parts(thing: Any) -> dict[str, Any]:
         return {each.name: getattr(thing, each.name) for each in fields(thing)}
     if isinstance(thing, FunctionType | MethodType):
         raise ModelFileError(
-            f"the Python function {thing.__name__!r} cannot be saved, since no file brings code: "
-            "use a named condition ('arrived', 'held', ...), or make the sequence where it runs"
+            f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
+            "conditions by name ('arrived', 'held', ...), or make the sequence where it runs"
         )
     raise ModelFileError(
         f"{type(thing).__name__} cannot be saved: make an operator a frozen dataclass, give a "

@@ -511,8 +511,9 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         ``"nominal"``, or names joined by ``+``: ``stopped``, ``pushed-back``,
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
         ``pose-noise``, ``biased``, ``sagging``, ``pose-lost``, ``pose-stale``,
-        ``irregular-ticks``, ``slips``, ``knocked``. A number behind a name says how many seconds, ``stopped-3``, and
-        one behind ``@`` when it happens, if that is not to be drawn: ``pushed-back-1.5@6``.
+        ``irregular-ticks``, ``slips``, ``knocked``. A number behind a name says how many
+        seconds, ``stopped-3``, and one behind ``@`` when it happens, if that is not to be
+        drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------

@@ -243,7 +243,7 @@ def statuses(
         What robots wait for at the end of a skill.
     """
     codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
-    if gates is not None and gates.texts:
+    if gates is not None and gates.reasons:
         texts = dict(gates.reasons)
         codes[list(texts)] = Status.WAITING.code
         codes[gates.failed] = Status.HOLDING.code

@@ -449,7 +449,7 @@ class Controller:
         if self._inputs is not None or not self._trusts:
             moment = self._moment(tick, postures)
         self._gates = gates = self._gates.advance(progress.time, passed, ready, moment)
-        self._progress = progress.gated(gates.stop, gates.goto, gates.resumed)
+        self._progress = progress.gated(gates.stop, gates.goto)
         begin, back = (self._tensor(each) for each in (gates.fade > 0, gates.returned))
         if begin.any():  # a skill begins with objects where they are now
             self._holds = self._holds.restarted(begin, postures)

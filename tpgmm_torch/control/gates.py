@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -26,6 +26,8 @@ __all__ = ["Gates", "Grip", "Moment"]
 #: Share of its way with a hand by which an object that is held may be off, as of holds that
 #: are found in how objects move.
 SHARE = 0.4
+#: While conditions are met for less than :data:`LOST_TIME`.
+SURE = "until that is certain"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,15 @@ class Moment:
     contacts: Mapping[str, Tensor]
     arrived: Tensor
 
+    @property
+    def no_robot(self) -> Tensor:
+        """False (...)."""
+        return self.arrived & False
+
+    def hidden(self, name: str) -> Tensor:
+        """Robots (...) that do not see an object now."""
+        return self.no_robot | self.unseen.get(name, self.no_robot)
+
 
 @dataclass(frozen=True, eq=False)
 class Grip:
@@ -84,41 +95,24 @@ class Grip:
 
     def update(self, hold: Hold, moment: Moment) -> Self:
         """After a tick."""
-        held = moment.holding.held.get(hold.frame)
         link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
-        holds = self.holds & False
-        if held is not None:
-            index = moment.holding.kinematics.links.index(hold.link)
-            holds = holds | (held.carrier.to(holds.device) == index)
+        index, held = moment.holding.kinematics.links.index(hold.link), moment.holding.held
+        holds = moment.no_robot
+        if hold.frame in held:
+            holds = holds | (held[hold.frame].carrier.to(holds.device) == index)
         new = holds & ~self.holds
-        begun = replace(
-            self,
-            link=choose(new, link, self.link),
-            thing=choose(new, thing, self.thing),
-            holds=holds,
-            carries=self.carries & holds & ~new,
+        grip = replace(
+            self, link=choose(new, link, self.link), thing=choose(new, thing, self.thing)
         )
-        off, way = begun.off(hold, moment)
-        along = holds & (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
-        return replace(
-            begun, carries=torch.where(unseen(hold, moment), begun.carries, along)
-        )
+        there = grip.carried(hold, moment)
+        off, way = (one.change(there, LOST, LOST_TURN) for one in (thing, grip.thing))
+        along = (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
+        known = torch.where(moment.hidden(hold.frame), self.carries & ~new, along)
+        return replace(grip, holds=holds, carries=holds & known)
 
-    def without(self, robots: Tensor) -> Self:
-        """After some robots (B,) begin to do it again."""
-        kept = ~robots.reshape(self.holds.shape).to(self.holds.device)
-        return replace(self, holds=self.holds & kept, carries=self.carries & kept)
-
-    def off(self, hold: Hold, moment: Moment) -> tuple[Tensor, Tensor]:
-        """How far the object is from where the link has it, or had it, and that from here.
-
-        In units of what counts as lost.
-        """
-        there, seen = self.carried(hold, moment), moment.frames[hold.frame]
-        return (
-            there.change(seen, LOST, LOST_TURN),
-            self.thing.change(there, LOST, LOST_TURN),
-        )
+    def kept(self, robots: Tensor) -> Self:
+        """For some robots (...) alone."""
+        return replace(self, holds=self.holds & robots, carries=self.carries & robots)
 
     def carried(self, hold: Hold, moment: Moment) -> Frame:
         """Where the object would be if the link had it from then on."""
@@ -138,18 +132,14 @@ class Gates:
         That number.
     waited, met_for : array of shape (B,)
         For how long they have stood at a gate, and its conditions were met [s].
-    met : bool array of shape (B,)
-        Whether they were when they were last asked for.
     tries : int array of shape (B, G)
         How often that took too long.
     failed : bool array of shape (B,)
         Robots that have given up.
-    resumed, returned : bool array of shape (B,)
-        Robots that go on at this tick after they stood; of these, those that go back.
     goto, fade : array of shape (B,)
-        Where their time is set to, NaN if it is not, and how long it takes to the beginning of
-        a separate skill, 0 if none begins [s].
-    texts : mapping of int to str
+        Where the time of robots is set to at this tick, NaN if it is not, and how long it takes
+        to the beginning of a separate skill, 0 if none begins [s].
+    reasons : mapping of int to str
         What robots wait for, or why they gave up.
     grips : mapping of Hold to Grip
         Of the objects that conditions ask for.
@@ -160,31 +150,23 @@ class Gates:
     index: NDArray[np.int_]
     waited: Array
     met_for: Array
-    met: Flags
     tries: NDArray[np.int_]
     failed: Flags
-    resumed: Flags
-    returned: Flags
     goto: Array
     fade: Array
-    texts: Mapping[int, str] = MappingProxyType({})
-    grips: Mapping[Hold, Grip] = field(default_factory=dict)
+    reasons: Mapping[int, str] = MappingProxyType({})
+    grips: Mapping[Hold, Grip] = MappingProxyType({})
 
     @classmethod
     def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:
         """At times (B,) of a skill; without enforcement all conditions count as met."""
         known = tuple(gate for gate in gates if time.min() < gate.time <= end)
-        last = float(np.nextafter(end, -np.inf))  # at the end itself a robot is done
-        stops = [
-            min(gate.time, last) if enforced and gate.until else np.inf for gate in known
-        ]
+        last = np.nextafter(end, -np.inf)  # at the end itself a robot is done
+        stops = [min(g.time, last) if enforced and g.until else np.inf for g in known]
         closed = np.minimum.accumulate([np.inf, *stops[::-1]])[::-1]
-        none = np.zeros(len(time), bool)
-        zero = none * 0.0
-        return cls(
-            known, closed, none.astype(int), zero, zero, none,
-            np.zeros((len(time), len(known)), int), none, none, none, zero + np.nan, zero,
-        )  # fmt: skip
+        zero, tries = np.zeros(len(time)), np.zeros((len(time), len(known)), int)
+        none = zero > 0
+        return cls(known, closed, none.astype(int), zero, zero, tries, none, zero, zero)
 
     @property
     def stop(self) -> Array:
@@ -195,6 +177,11 @@ class Gates:
     def since(self) -> Array:
         """Beginnings of the skills in which robots are (B,) [s]."""
         return np.array([-np.inf, *(gate.time + gate.fade for gate in self.gates)])[self.index]
+
+    @property
+    def returned(self) -> Flags:
+        """Robots that go back at this tick."""
+        return np.isfinite(self.goto) & (self.fade == 0)
 
     def advance(self, time: Array, dt: Array, ready: Flags, moment: Moment | None) -> Self:
         """After a tick.
@@ -210,173 +197,125 @@ class Gates:
         moment : Moment, optional
             What is known; without it, as when somebody looks ahead, gates stay as they are.
         """
-        none = np.zeros(len(time), bool)
-        new = replace(
-            self, resumed=none, returned=none, goto=none * np.nan, fade=none * 0.0
-        )._crossed(time)
-        if moment is not None:
-            new = replace(new, grips=new._gripped(moment))
+        new = replace(self, goto=np.full_like(time, np.nan), fade=np.zeros_like(time))
+        for number, gate in enumerate(self.gates):  # those without conditions
+            if self.closed[number] > gate.time:
+                rows = (new.index == number) & (time > gate.time)
+                new = new._opened(rows, np.maximum(time, gate.onward))
         stands = time >= new.stop
         at = stands & ready & ~self.failed
-        if not stands.any():
-            return replace(new, waited=none * 0.0, met_for=none * 0.0, texts={})
-        met, texts = new._asked(at, moment) if moment is not None else (new.met, new.texts)
-        texts = {row: text for row, text in {**self.texts, **texts}.items() if stands[row]}
+        waited = np.where(at, new.waited + dt, stands * new.waited)
+        if moment is None:
+            met_for = np.where(at & (new.met_for > 0), new.met_for + dt, new.met_for)
+            return replace(new, waited=waited, met_for=met_for)
         new = replace(
-            new,
-            waited=np.where(at, new.waited + dt, stands * new.waited),
-            met_for=np.where(at, met * (new.met_for + dt), stands * new.met_for),
-            met=met,
-            texts=texts,
+            new, grips=new._gripped(moment), waited=waited, met_for=stands * new.met_for
         )
-        return new if moment is None else new._decided(at)
+        kept = {row: text for row, text in self.reasons.items() if stands[row] and not at[row]}
+        return new._decided(at, dt, moment, kept) if stands.any() else replace(new, reasons={})
 
-    def _crossed(self, time: Array) -> Self:
-        """Robots beyond gates without conditions have passed them."""
-        new = self
-        for number, gate in enumerate(self.gates):
-            open_ = self.closed[number] > gate.time
-            rows = (new.index == number) & (time > gate.time)
-            if open_ and rows.any():
-                new = new._opened(rows, np.maximum(time, gate.onward))
-        return new
-
-    def _opened(self, rows: Flags, time: Array) -> Self:
+    def _opened(self, rows: Flags, time: Any) -> Self:
         """Some robots have passed the next gate, and go on from a time."""
-        fades = np.array([*(gate.fade for gate in self.gates), 0.0])[self.index]
+        if not rows.any():
+            return self
+        fades = np.where(rows, np.array([*(g.fade for g in self.gates), 0.0])[self.index], 0)
         return replace(
             self,
             index=self.index + rows,
-            fade=np.where(rows, fades, self.fade),
-            goto=np.where(rows & (fades > 0), time, self.goto),
-            waited=np.where(rows, 0.0, self.waited),
-            met_for=np.where(rows, 0.0, self.met_for),
+            fade=self.fade + fades,
+            goto=np.where(fades > 0, time, self.goto),
         )
 
     def _gripped(self, moment: Moment) -> Mapping[Hold, Grip]:
         """The links and objects that conditions ask for."""
         grips = dict(self.grips)
-        for hold in {hold for gate in self.gates for hold in _asked_holds(gate)}:
+        for hold in (hold for gate in self.gates for hold in gate.watched):
             if hold.frame in moment.frames:
-                link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
-                none = moment.arrived & False
-                before = grips.get(hold) or Grip(link, thing, none, none)
-                grips[hold] = before.update(hold, moment)
+                if hold not in grips:
+                    link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
+                    grips[hold] = Grip(link, thing, moment.no_robot, moment.no_robot)
+                grips[hold] = grips[hold].update(hold, moment)
         return grips
 
-    def _asked(self, at: Flags, moment: Moment) -> tuple[Flags, Mapping[int, str]]:
-        """Of robots at their gates, whether conditions are met, and which one is not."""
-        met, texts = at.copy(), dict[int, str]()
-        for number in np.unique(self.index[at]):
-            rows = at & (self.index == number)
-            for condition in self.gates[number].until:
-                flags, why = _verdict(condition, self.gates[number], moment, self.grips)
-                met &= np.where(rows, flags, True)
-                for row in np.flatnonzero(rows & ~flags):
-                    name = getattr(condition, "__name__", condition)
-                    texts.setdefault(int(row), f"{name!r} not met|{why(int(row))}")
-        return met, texts
-
-    def _decided(self, at: Flags) -> Self:
-        """Robots go on, go back, or give up."""
-        number = np.minimum(self.index, len(self.gates) - 1)
-        limit = np.array([(gate.timeout, gate.retries, gate.back) for gate in self.gates])
-        timeout, retries, back = limit[number].T
-        opens = at & self.met & (self.met_for >= LOST_TIME)
-        late = at & ~self.met & (self.waited >= timeout)
-        tries = self.tries.copy()
-        tries[np.flatnonzero(late), number[late]] += 1
-        fails = late & (tries[np.arange(len(at)), number] > retries)
-        goes = late & ~fails
-        onward = np.array([gate.onward for gate in self.gates])[number]
-        new = self._opened(opens, onward)
-        texts = dict(new.texts)
-        for row in np.flatnonzero(fails).tolist():
-            count = tries[row, number[row]]
-            tried = f" after {count} tries" if count > 1 else ""
-            texts[row] = texts[row].replace(" not met|", f" not met{tried}|", 1)
-        times = [gate.time for gate in self.gates]
-        where = torch.from_numpy(goes)
-        return replace(
-            new,
-            index=np.where(goes, np.searchsorted(times, back, side="right"), new.index),
-            goto=np.where(goes, back, new.goto),
-            waited=np.where(goes, 0.0, new.waited),
-            met_for=np.where(goes, 0.0, new.met_for),
+    def _decided(self, at: Flags, dt: Array, moment: Moment, reasons: dict[int, str]) -> Self:
+        """Robots at their gates wait, go on, go back, or give up."""
+        met_for, tries, failed = self.met_for.copy(), self.tries.copy(), self.failed.copy()
+        opens, goto, waited = at & False, self.goto.copy(), self.waited.copy()
+        for number in np.unique(self.index[at]).tolist():
+            gate = self.gates[number]
+            unmet = {_name(each): self._unmet(each, gate, moment) for each in gate.until}
+            for row in np.flatnonzero(at & (self.index == number)).tolist():
+                first = next((name for name, why in unmet.items() if why[row]), None)
+                met_for[row] = 0.0 if first else met_for[row] + dt[row]
+                reasons[row] = f"{first!r} not met: {unmet[first][row]}" if first else SURE
+                opens[row] = met_for[row] >= LOST_TIME
+                if first and waited[row] >= gate.timeout:
+                    tries[row, number] += 1
+                    count = int(tries[row, number])
+                    failed[row] = count > gate.retries
+                    goto[row] = np.nan if failed[row] else gate.back
+                    after = f" after {count} tries" if count > 1 else ""
+                    reasons[row] = reasons[row].replace(" not met", f" not met{after}", 1)
+        back = np.isfinite(goto) & at
+        moved, times = back | opens, [gate.time for gate in self.gates]
+        kept = torch.from_numpy(~back).view(moment.arrived.shape)
+        new = replace(
+            self,
+            index=np.where(back, np.searchsorted(times, goto, side="right"), self.index),
+            waited=np.where(moved, 0.0, waited),
+            met_for=np.where(moved, 0.0, met_for),
             tries=tries,
-            failed=self.failed | fails,
-            resumed=opens | goes,
-            returned=goes,
-            texts={row: text for row, text in texts.items() if not (opens | goes)[row]},
-            grips={h: grip.without(where) for h, grip in new.grips.items()},
+            failed=failed,
+            goto=goto,
+            reasons={row: text for row, text in reasons.items() if not moved[row]},
+            grips={hold: grip.kept(kept) for hold, grip in self.grips.items()},
         )
+        onward = np.array([*(gate.onward for gate in self.gates), np.inf])[self.index]
+        return new._opened(opens, onward)
 
-    @property
-    def reasons(self) -> Mapping[int, str]:
-        """What robots wait for, or why they gave up, in words."""
-        return {row: text.replace("|", ": ", 1) for row, text in self.texts.items()}
+    def _unmet(self, condition: Condition, gate: Gate, moment: Moment) -> list[str]:
+        """Why a condition is not met by each robot (B,); empty where it is."""
+        if condition in ("held", "free"):
+            holds = gate.held if condition == "held" else gate.freed
+            each = [self._not_held(hold, moment, condition == "free") for hold in holds]
+            return [next(filter(None, texts), "") for texts in zip(*each, strict=True)]
+        why, met = "it is false", moment.no_robot
+        if condition == "arrived":
+            why, met = "joints move, or are not at their reference", moment.arrived
+        elif isinstance(condition, str):
+            link = condition.removeprefix(CONTACT)
+            why = f"{link} touches nothing"
+            if link not in moment.contacts:
+                why = "no contact is measured there"
+            met = moment.contacts.get(link, met)
+        else:
+            try:
+                met = torch.as_tensor(condition(moment), dtype=torch.bool)
+            except Exception as error:  # of a user's function, which must not stop the loop
+                why = f"it raised {error!r}"
+        return ["" if one else why for one in _rows(met.expand(moment.arrived.shape))]
+
+    def _not_held(self, hold: Hold, moment: Moment, free: bool) -> list[str]:
+        """Why an object is not held, or not free, by each robot (B,)."""
+        name, grip = hold.frame, self.grips.get(hold)
+        if grip is None:
+            return [f"{name} is nowhere"] * moment.arrived.numel()
+        there, seen = grip.carried(hold, moment), moment.frames[name]
+        hidden = moment.hidden(name)
+        lost = there.change(seen, LOST, LOST_TURN) >= 1
+        met = ~grip.holds & ~hidden & lost if free else grip.carries
+        apart = (there.position - seen.position).norm(dim=-1)
+        table = (each.expand(met.shape) for each in (met, hidden, apart))
+        return [
+            "" if ok
+            else f"{name} is not seen" if gone
+            else f"{name} is {1e3 * away:.0f} mm from where {hold.link} would carry it"
+            for ok, gone, away in zip(*map(_rows, table), strict=True)
+        ]  # fmt: skip
 
 
-def _asked_holds(gate: Gate) -> tuple[Hold, ...]:
-    """Holds whose objects have to be watched for a gate."""
-    return gate.held * ("held" in gate.until) + gate.freed * ("free" in gate.until)
-
-
-def unseen(hold: Hold, moment: Moment) -> Tensor:
-    """Robots (...) that do not see the object of a hold now."""
-    return moment.unseen.get(hold.frame, moment.arrived & False)
-
-
-def _verdict(
-    condition: Condition, gate: Gate, moment: Moment, grips: Mapping[Hold, Grip]
-) -> tuple[Flags, Callable[[int], str]]:
-    """For which robots (B,) a condition is met, and why not for one of them."""
-    if condition == "arrived":
-        return _rows(moment.arrived), lambda row: "joints move, or are not at their reference"
-    if condition in ("held", "free"):
-        holds = gate.held if condition == "held" else gate.freed
-        each = [(hold, *_of_hold(condition, hold, moment, grips.get(hold))) for hold in holds]
-        met = np.logical_and.reduce([flags for _, flags, _ in each])
-        return met, lambda row: next(why(row) for _, flags, why in each if not flags[row])
-    if isinstance(condition, str):
-        link = condition.removeprefix(CONTACT)
-        if link not in moment.contacts:
-            return _rows(moment.arrived & False), lambda row: "no contact is measured there"
-        touching = moment.contacts[link].expand(moment.arrived.shape)
-        return _rows(touching), lambda row: f"{link} touches nothing"
-    try:
-        found = torch.as_tensor(condition(moment), dtype=torch.bool)
-        return _rows(found.expand(moment.arrived.shape)), lambda row: "it is false"
-    except Exception as error:  # of a user's function, which must not stop robots' loop
-        text = repr(error)
-        return _rows(moment.arrived & False), lambda row: f"it raised {text}"
-
-
-def _of_hold(
-    condition: str, hold: Hold, moment: Moment, grip: Grip | None
-) -> tuple[Flags, Callable[[int], str]]:
-    """For which robots an object is held, or free."""
-    name, link = hold.frame, hold.link
-    hidden = _rows(unseen(hold, moment))
-    if grip is None:
-        return hidden & False, lambda row: f"it is not known where {name} is"
-    off, way = (_rows(each) for each in grip.off(hold, moment))
-    carried, seen = grip.carried(hold, moment), moment.frames[name]
-    shape = moment.arrived.shape
-    apart = _rows((carried.position - seen.position).norm(dim=-1).expand(shape))
-    if condition == "free":
-        met = ~_rows(grip.holds) & ~hidden & (off >= 1)
-    else:
-        met = _rows(grip.carries)
-
-    def why(row: int) -> str:
-        if hidden[row]:
-            return f"{name} is not seen"
-        if condition == "held" and way[row] < MOVED / LOST:
-            return f"{link} has not carried {name} by {100 * MOVED:.0f} cm yet"
-        return f"{name} is {1e3 * apart[row]:.0f} mm from where {link} would carry it"
-
-    return met, why
+def _name(condition: Condition) -> str:
+    return condition if isinstance(condition, str) else getattr(condition, "__name__", "it")
 
 
 def _rows(values: Tensor) -> Any:

@@ -228,26 +228,18 @@ class Progress:
         there = (there & rests) | ~known
         return (there & (np.abs(velocity) <= FLOOR)).all(-1) & (self.mode == RUNNING)
 
-    def gated(self, stop: Array, time: Array, resumed: Flags) -> Self:
-        """Progress up to other times, of robots that may go on at another time.
+    def gated(self, stop: Array, time: Array) -> Self:
+        """Progress up to other times, of robots that may go on from another time.
 
         Parameters
         ----------
         stop : array of shape (B,)
             Time beyond which robots do not go [s].
         time : array of shape (B,)
-            Where they go on; NaN where they are.
-        resumed : bool array of shape (B,)
-            Robots that stood.
+            From where they go on; NaN from where they are.
         """
-        set_ = np.isfinite(time)
-        return changed(
-            self,
-            stop=stop,
-            time=np.where(set_, time, self.time),
-            rest_time=np.where(set_, time, self.rest_time),
-            rate=np.where(resumed, 0.0, self.rate),
-        )
+        now, rest = (np.where(np.isfinite(time), time, x) for x in (self.time, self.rest_time))
+        return changed(self, stop=stop, time=now, rest_time=rest)
 
     def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
         """Where references go: of robots that run, the wanted postures (B, n_joints).

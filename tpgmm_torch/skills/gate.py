@@ -55,6 +55,11 @@ class Gate:
     name: str = ""
 
     @property
+    def watched(self) -> tuple[Hold, ...]:
+        """Holds whose objects the conditions ask for."""
+        return self.held * ("held" in self.until) + self.freed * ("free" in self.until)
+
+    @property
     def onward(self) -> float:
         """Where time goes on from when the gate opens: the next skill takes over [s]."""
         return self.time + SWITCH * self.fade

@@ -26,10 +26,7 @@ __all__ = ["Sequence"]
 
 #: Default of ``fade``: between parts of one demonstration, and between separate skills [s].
 PARTS_FADE, SKILLS_FADE = 0.2, 1.0
-PART = re.compile(
-    r"(?P<name>\S+)(?:\s+until\s+(?P<until>\S+))?(?:\s+within\s+(?P<timeout>\S+))?"
-    r"(?:\s+retry\s+(?P<retry>\d+)(?:\s+from\s+(?P<back>\S+))?)?"
-)
+PART = re.compile(r"(\S+)(?:\s+until\s+(\S+))?(?:\s+retry\s+(\d+)(?:\s+from\s+(\S+))?)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +57,8 @@ class Sequence(CompositeSkill):
         How often it is tried again if that is not the case in time, one number for all skills,
         or one of each; a pair ``(number, skill)`` says from the beginning of which skill, by
         name or index, by default the one that failed. Then the robot holds.
-    timeout : float or sequence of float, default=2.0
-        How long it is waited for [s].
+    timeout : float, default=2.0
+        How long each is waited for [s].
     names : sequence of str, default=()
         Of the skills; by default their numbers.
 
@@ -79,17 +76,17 @@ class Sequence(CompositeSkill):
     fade: float | None = None
     until: tuple[tuple[Any, ...], ...] = ()
     retry: tuple[tuple[int, int], ...] = ()
-    timeout: tuple[float, ...] = ()
+    timeout: float = 2.0
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        skills = tuple(self.skills)
-        names = tuple(self.names) or tuple(str(k) for k in range(len(skills)))
-        self._set(skills=skills, names=names)
-        if not skills or not (self.fade is None or 0 < self.fade < math.inf):
-            raise DataError(f"a sequence has skills and a positive fade, got {self!r}")
-        if len(names) != len(skills) or len(set(names)) < len(names):
-            raise DataError(f"{len(skills)} skills need a name each, got {list(names)}")
+        skills, count = tuple(self.skills), len(self.skills)
+        names = tuple(self.names) or tuple(map(str, range(count)))
+        seconds = self.timeout if self.fade is None else min(self.fade, self.timeout)
+        if not skills or not 0 < seconds < math.inf:
+            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
+        if len(names) != count or len(set(names)) < count:
+            raise DataError(f"{count} skills need a name each, got {list(names)}")
         for one, other in pairwise(skills):
             if one.kinematics.joint_names != other.kinematics.joint_names:
                 raise DataError("the skills of a sequence are of different robots")
@@ -101,111 +98,58 @@ class Sequence(CompositeSkill):
                     "and those learned separately each begin at the beginning"
                 )
         parts = all(_shares_clock(one, other, PARTS_FADE) for one, other in pairwise(skills))
-        self._set(fade=self.fade or (PARTS_FADE if parts else SKILLS_FADE))
-        untils, retries, timeouts = (
-            _of_each(value, len(skills), what)
-            for value, what in (
-                (self.until or None, "until"), (self.retry or 0, "retry"),
-                (self.timeout or 2.0, "timeout"),
-            )
-        )  # fmt: skip
-        self._set(
-            until=tuple(self._conditions(*each) for each in zip(skills, untils, strict=True)),
-            retry=tuple(self._retry(k, each) for k, each in enumerate(retries)),
-            timeout=tuple(map(_positive, timeouts)),
-        )
-
-    def _set(self, **values: Any) -> None:
-        for name, value in values.items():
+        several: dict[str, Any] = {"until": self.until or None, "retry": self.retry or 0}
+        for what, value in several.items():
+            several[what] = value if isinstance(value, tuple | list) else [value] * count
+            if len(several[what]) != count:
+                raise DataError(f"{what} has {len(value)} entries for {count} skills: {value}")
+        for name, value in {
+            "skills": skills,
+            "names": names,
+            "fade": self.fade or (PARTS_FADE if parts else SKILLS_FADE),
+            "until": tuple(map(_conditions, skills, several["until"])),
+            "retry": tuple(_retry(names, *each) for each in enumerate(several["retry"])),
+        }.items():
             object.__setattr__(self, name, value)
 
     @classmethod
     def parse(
-        cls,
-        text: str,
-        skills: Mapping[str, Skill] | Callable[[str], Skill],
-        fade: float | None = None,
+        cls, text: str, skills: Mapping[str, Skill] | Callable[[str], Skill], **options: Any
     ) -> Self:
         """A sequence from one line of text.
 
         Parameters
         ----------
         text : str
-            Skills, separated by commas, each ``NAME [until CONDITION[+CONDITION]] [within
-            SECONDS] [retry NUMBER [from NAME]]``.
+            Skills, separated by commas, each ``NAME [until CONDITION[+CONDITION]] [retry NUMBER
+            [from NAME]]``.
         skills : mapping of str to Skill, or callable
             What the names stand for. Of a path the last part is the name.
-        fade : float, optional
+        **options
+            ``fade`` and ``timeout``.
 
         Raises
         ------
         DataError, UnknownNameError
             If a part is not of this form, a name is not known, or as of the sequence.
         """
-        given = []
-        for part in text.split(","):
-            match = PART.fullmatch(part.strip())
+        found, untils, retries, names = [], [], [], []
+        for number, part in enumerate(map(str.strip, text.split(","))):
+            match = PART.fullmatch(part)
             if match is None:
                 raise DataError(
-                    f"{part.strip()!r} in {text!r} is not of the form NAME [until CONDITION] "
-                    "[within SECONDS] [retry NUMBER [from NAME]]"
+                    f"{part!r} in {text!r} is not of the form NAME [until CONDITION] "
+                    "[retry NUMBER [from NAME]]"
                 )
-            given.append(match)
-        found = []
-        for each in given:
-            if isinstance(skills, Mapping) and each["name"] not in skills:
-                raise UnknownNameError("skill", each["name"], "the sequence", skills)
-            called = skills.__getitem__ if isinstance(skills, Mapping) else skills
-            found.append(called(each["name"]))
-        retry = [(int(one["retry"] or 0), one["back"] or k) for k, one in enumerate(given)]
-        return cls(
-            tuple(found),
-            fade,
-            until=tuple(one["until"] for one in given),
-            retry=tuple(retry),  # type: ignore[arg-type]
-            timeout=tuple(one["timeout"] or 2.0 for one in given),  # type: ignore[misc]
-            names=tuple(PurePath(one["name"]).name for one in given),
-        )
-
-    def _conditions(self, skill: Skill, given: Any) -> tuple[Condition, ...]:
-        """Conditions at the end of a skill, checked."""
-        several = given if isinstance(given, tuple | list) else [given]
-        found: tuple[Condition, ...] = ()
-        for one in filter(None, several):
-            found += tuple(map(str.strip, one.split("+"))) if isinstance(one, str) else (one,)
-        links = skill.kinematics.links
-        for one in found:
-            if isinstance(one, str) and one.startswith(CONTACT):
-                if (link := one.removeprefix(CONTACT)) not in links:
-                    raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
-            elif not callable(one) and one not in CONDITIONS:
-                raise DataError(
-                    f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, "
-                    f"got {one!r}"
-                )
-        for one, holds in (("held", _held(skill)), ("free", _freed(skill))):
-            if one in found and not holds:
-                raise DataError(
-                    f"until {one!r}: the skill ends without an object that is {one} by then; "
-                    f"its holds are {[str(hold) for hold in skill.holds]}"
-                )
-        return found
-
-    def _retry(self, number: int, given: Any) -> tuple[int, int]:
-        """How often, and from which skill on."""
-        times, back = given if isinstance(given, tuple | list) else (given, number)
-        if isinstance(back, str):
-            if back not in self.names:
-                raise UnknownNameError("skill", back, "the sequence", self.names)
-            back = self.names.index(back)
-        if not (isinstance(times, int) and isinstance(back, int) and 0 <= times):
-            raise DataError(f"retry is a number, or a pair (number, skill), got {given!r}")
-        if not 0 <= back <= number:
-            raise DataError(
-                f"{self.names[number]!r} is tried again from itself or a skill before it, "
-                f"got retry={given!r}"
-            )
-        return times, back
+            name, until, times, back = match.groups()
+            if isinstance(skills, Mapping) and name not in skills:
+                raise UnknownNameError("skill", name, "the sequence", skills)
+            found.append(skills[name] if isinstance(skills, Mapping) else skills(name))
+            names.append(PurePath(name).name)
+            untils.append(until)
+            retries.append((int(times or 0), back or number))
+        several: Any = {"until": untils, "retry": retries, "names": names}
+        return cls(tuple(found), **several, **options)
 
     @cached_property
     def _shifts(self) -> tuple[float, ...]:
@@ -270,25 +214,23 @@ class Sequence(CompositeSkill):
             every = dict.fromkeys(hold for one in self.skills for hold in one.holds)
             return tuple(sorted(every, key=lambda hold: (hold.begin, hold.end)))
         found: dict[str, list[Hold]] = {}
-        spans = zip(self.skills, self._shifts, self._edges, strict=True)
-        for one, by, (begin, end) in spans:
-            own = [hold.retimed(lambda at, by=by: at + by) for hold in one.holds]  # type: ignore[misc]
-            for hold in sorted(own, key=lambda hold: hold.begin):
+        spans = zip(self.skills, self._shifts, self._stretches, strict=True)
+        for one, by, (begin, stop) in spans:
+            for hold in sorted(one.holds, key=lambda hold: hold.begin):
                 several = found.setdefault(hold.frame, [])
-                last = several[-1] if several else None
-                early = max(hold.begin, begin)
-                if last is not None and last.end > early:  # from a skill before
-                    several[-1] = replace(last, end=early)
-                    if last.link == hold.link:
-                        early = several.pop().begin
-                several.append(replace(hold, begin=early, end=_open(hold.end, end)))
-        return tuple(sorted((h for each in found.values() for h in each), key=lambda h: h.begin))
-
-    @property
-    def _edges(self) -> list[tuple[float, float]]:
-        """From when to when what a skill holds counts [s]: its beginning, the next one's."""
-        begins = [begin for begin, _ in self._stretches]
-        return list(zip(begins, [*begins[1:], math.inf], strict=True))
+                early, late = max(hold.begin + by, begin), hold.end + by
+                if late <= early:
+                    continue
+                if several and several[-1].end > early:  # held on from a skill before
+                    last = several.pop()
+                    if last.link != hold.link:
+                        several.append(replace(last, end=early))
+                    early = last.begin if last.link == hold.link else early
+                several.append(
+                    replace(hold, begin=early, end=late if late < stop else math.inf)
+                )
+        merged = (hold for several in found.values() for hold in several)
+        return tuple(sorted(merged, key=lambda hold: hold.begin))
 
     @cached_property
     def gates(self) -> tuple[Gate, ...]:
@@ -300,8 +242,9 @@ class Sequence(CompositeSkill):
             by, (times, back) = self._shifts[k], self.retry[k]
             inner = [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
             own = Gate(
-                self._stretches[k][1], self.until[k], self.timeout[k], times,
-                self._stretches[back][0], separate[k] * self.fade, _held(one), _freed(one), name,
+                self._stretches[k][1], self.until[k], self.timeout, times,
+                self._stretches[back][0], separate[k] * self.fade,
+                _held(one), _freed(one), name,
             )  # fmt: skip
             gates += [*inner, own] if self.until[k] or separate[k] else inner
         return tuple(gates)
@@ -386,20 +329,39 @@ def _open(end: float, edge: float) -> float:
     return end if end < edge else math.inf
 
 
-def _of_each(value: Any, count: int, what: str) -> list[Any]:
-    """A value of each skill."""
-    if not isinstance(value, tuple | list):
-        return [value] * count
-    if len(value) != count:
-        raise DataError(f"{what} has {len(value)} entries for {count} skills: {value!r}")
-    return list(value)
+def _conditions(skill: Skill, given: Any) -> tuple[Condition, ...]:
+    """Conditions at the end of a skill, checked."""
+    found, links = list[Condition](), skill.kinematics.links
+    for one in given if isinstance(given, tuple | list) else [given or ""]:
+        found += filter(None, map(str.strip, one.split("+"))) if isinstance(one, str) else [one]
+    for one in found:
+        link = one.removeprefix(CONTACT) if isinstance(one, str) else ""
+        if link != one and link and link not in links:
+            raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
+        if not callable(one) and one not in CONDITIONS and one != CONTACT + link:
+            raise DataError(
+                f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, got "
+                f"{one!r}"
+            )
+    for name, holds in (("held", _held(skill)), ("free", _freed(skill))):
+        if name in found and not holds:
+            raise DataError(
+                f"until {name!r}: no object is {name} by the end of this skill, of which the "
+                f"holds are {[str(hold) for hold in skill.holds]}"
+            )
+    return tuple(found)
 
 
-def _positive(value: Any) -> float:
-    try:
-        seconds = float(value)
-    except (TypeError, ValueError):
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise DataError(f"timeout is a positive number of seconds, got {value!r}")
-    return seconds
+def _retry(names: tuple[str, ...], number: int, given: Any) -> tuple[int, int]:
+    """How often a skill is tried again, and from which one on."""
+    times, back = given if isinstance(given, tuple | list) else (given, number)
+    if isinstance(back, str):
+        if back not in names:
+            raise UnknownNameError("skill", back, "the sequence", names)
+        back = names.index(back)
+    if not (isinstance(times, int) and isinstance(back, int) and times >= 0 <= back <= number):
+        raise DataError(
+            f"{names[number]!r} is tried again a number of times, from itself or from a skill "
+            f"before it: retry is that number, or a pair (number, skill), got {given!r}"
+        )
+    return times, back

@@ -23,4 +23,4 @@ SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 #: The same of tasks that are in no comparison.
-MORE: Mapping[str, tuple[str, ...]] = MappingProxyType({"pick_place": ("can", "mat")})
+MORE: Mapping[str, tuple[str, ...]] = MappingProxyType({"pick_place": ("baton", "stand")})
