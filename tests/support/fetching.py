@@ -1,6 +1,7 @@
 """Pick, place, home: three skills of a tracked hand, each from five demonstrations of its own."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ TAKES, LEAVES = 1.3, 1.3
 def way(time, *stops):
     """Through (time, place), with minimum jerk from each to the next."""
     path = np.repeat(np.array([stops[0][1]]), len(time), 0)
-    for (begin, one), (end, other) in zip(stops[:-1], stops[1:], strict=True):
+    for (begin, one), (end, other) in pairwise(stops):
         s = np.clip((time - begin) / (end - begin), 0, 1)[:, None]
         path = path + s**3 * (10 - 15 * s + 6 * s**2) * (np.array(other) - one)
     return path

@@ -335,10 +335,10 @@ def _conditions(skill: Skill, given: Any) -> tuple[Condition, ...]:
     for one in given if isinstance(given, tuple | list) else [given or ""]:
         found += filter(None, map(str.strip, one.split("+"))) if isinstance(one, str) else [one]
     for one in found:
-        link = one.removeprefix(CONTACT) if isinstance(one, str) else ""
-        if link != one and link and link not in links:
-            raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
-        if not callable(one) and one not in CONDITIONS and one != CONTACT + link:
+        if isinstance(one, str) and (link := one.partition(CONTACT)[2]):
+            if link not in links:
+                raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
+        elif not callable(one) and one not in CONDITIONS:
             raise DataError(
                 f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, got "
                 f"{one!r}"
