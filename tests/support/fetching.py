@@ -1,4 +1,4 @@
-"""Pick, place, home: three skills of a tracked hand, each from five demonstrations of its own."""
+"""Pick, place, home: skills of a tracked hand, each from five demonstrations of its own."""
 
 from functools import cache
 from itertools import pairwise
@@ -44,10 +44,11 @@ def demonstration(name: str, rng: np.random.Generator) -> Demonstration:
         "place": ((0, cup + LIFT), (1.0, tray), (1.4, tray), (1.9, tray + LIFT + near)),
         "home": ((0, tray + LIFT + near), (1.7, START)),
     }[name]
-    thing = cup + LIFT if name == "place" else cup  # where it is when that skill begins
+    path = way(time, *stops)
+    held = {"pick": time >= TAKES, "place": time < LEAVES, "home": time < 0}[name]
+    thing = np.where(held[:, None], path, cup if name == "pick" else tray)
     holds = {"pick": (Hold("cup", "hand", TAKES),), "place": (Hold("cup", "hand", end=LEAVES),)}
     frames = {"cup": Frame(thing), "tray": Frame(tray)}
-    path = way(time, *stops)
     return Demonstration(time, path, frames, HAND.joint_names, holds=holds.get(name, ()))
 
 

@@ -28,7 +28,7 @@ def test_a_spoilt_grasp_leaves_the_baton_and_the_hand_may_take_it_again(motion, 
     begun = motion.joints[0].numpy()
     replay(env, motion, seconds=motion.events["lift"])
     [hold] = TASK.holds
-    assert not env._scene.held and env._scene.gap(hold) > 0.0
+    assert not env._scene.held
     for _ in range(2 * RATE):
         env.step(begun)
     stands = env._scene.pose("baton")
