@@ -30,8 +30,8 @@ from tpgmm_torch.robots import Poses
 # %%
 # Three skills
 # ------------
-# A tracked hand, without a robot. Each skill begins at time 0 of its own demonstrations, and
-# knows the objects as they are then: the cup of ``place`` is in the hand, 10 cm up.
+# A tracked hand, without a robot. Each skill begins at time 0 of its own demonstrations: those
+# of ``place`` begin with the cup in the hand, 10 cm up.
 
 HAND = Poses(["hand"], orientation=False)
 FPS, UP, START = 25, np.array([0, 0, 0.1]), np.array([0, 0, 0.3])
@@ -64,11 +64,15 @@ def demonstrate(name):
     return Demonstration(time, path, frames, HAND.joint_names, holds=holds)
 
 
+matters = {
+    "pick": [RelativePosition("hand", "cup")],
+    "place": [RelativePosition("hand", "tray"), RelativePosition("cup", "tray", held=True)],
+    "home": [],
+}
 skills = {}
-for name, seen in {"pick": ["cup"], "place": ["cup", "tray"], "home": []}.items():
-    operators = [*(RelativePosition("hand", frame) for frame in seen), Canonical()]
-    shown = [demonstrate(name) for _ in range(5)]
-    skills[name] = TaskParameterizedGMM(8, operators, HAND).fit(shown).skill
+for name, operators in matters.items():
+    model = TaskParameterizedGMM(8, [*operators, Canonical()], HAND)
+    skills[name] = model.fit([demonstrate(name) for _ in range(5)]).skill
 
 # %%
 # One skill of the three
