@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import UnionType
+from types import FunctionType, MethodType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -305,6 +305,11 @@ def _parts(thing: Any) -> dict[str, Any]:
         return {"skill": thing.skill, "points": thing.points, "fade": thing.fade}
     if is_dataclass(thing):
         return {each.name: getattr(thing, each.name) for each in fields(thing)}
+    if isinstance(thing, FunctionType | MethodType):
+        raise ModelFileError(
+            f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
+            "conditions by name ('arrived', 'held', ...), or make the sequence where it runs"
+        )
     raise ModelFileError(
         f"{type(thing).__name__} cannot be saved: make an operator a frozen dataclass, give a "
         "robot config() and a classmethod from_config()"

@@ -22,8 +22,8 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = [
     "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
-    "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "StartedMidway",
-    "Stopped", "displaced", "generators", "parse_condition",
+    "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "Spoilt",
+    "StartedMidway", "Stopped", "displaced", "generators", "parse_condition",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -469,6 +469,40 @@ class Live(Disturbance):
     live: ClassVar[bool] = True
 
 
+@dataclass(frozen=True)
+class Spoilt(Disturbance):
+    """The first grasp of the first object fails: it slips out of the hand when it is lifted.
+
+    Parameters
+    ----------
+    distance : float, default=0
+        Above 0 the hand pushes it aside by this as it closes, and does not take it [m].
+    seconds : float, default=15.0
+        How much longer an episode is for it.
+    step : ndarray of shape (6,), optional
+        The displacement: [m], then [rad].
+    """
+
+    live: ClassVar[bool] = True
+    distance: float = 0.0
+    seconds: float = 15.0
+    step: Vector | None = dataclasses.field(default=None, compare=False)
+
+    @property
+    def delay(self) -> float:
+        """To try again."""
+        return self.seconds
+
+    def drawn(
+        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
+    ) -> Self:
+        """With the displacement of the episode, as of :class:`Moved`."""
+        if not self.distance:
+            return self
+        moved = Moved(self.distance, 0.0, step=self.step).drawn(rng, course, usual)
+        return dataclasses.replace(self, step=moved.step)
+
+
 _KINDS: Mapping[str, Disturbance] = MappingProxyType(
     {
         "stopped": Stopped(),
@@ -487,13 +521,17 @@ _KINDS: Mapping[str, Disturbance] = MappingProxyType(
         "lower": Misplaced(height=-0.005),
         "higher": Misplaced(height=0.005),
         "tilted": Misplaced(angle=math.radians(3)),
+        "slips": Spoilt(),
+        "knocked": Spoilt(distance=0.04),
     }
 )
+#: Those of one task.
+OF_ONE_TASK = ("lower", "higher", "tilted", "slips", "knocked")
 _NUMBER = r"(\d+(?:\.\d+)?)"
 #: Those that a comparison runs through. At 3 s a stop keeps the hands from the grasp.
 CONDITIONS = (
     *(NOMINAL, "stopped-1", "stopped-2", "stopped-3", "stopped-5", "stopped-10", "stopped-3@3"),
-    *(n for n, kind in _KINDS.items() if n != "stopped" and not isinstance(kind, Misplaced)),
+    *(name for name in _KINDS if name not in ("stopped", *OF_ONE_TASK)),
 )
 
 
@@ -506,9 +544,9 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         ``"nominal"``, or names joined by ``+``: ``stopped``, ``pushed-back``,
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
         ``pose-noise``, ``biased``, ``sagging``, ``pose-lost``, ``pose-stale``,
-        ``irregular-ticks``, ``lower``, ``higher``, ``tilted``. A number behind a name says how
-        many seconds, ``stopped-3``, and one behind ``@`` when it happens, if that is not to be
-        drawn: ``pushed-back-1.5@6``.
+        ``irregular-ticks``, ``lower``, ``higher``, ``tilted``, ``slips``, ``knocked``. A number
+        behind a name says how many seconds, ``stopped-3``, and one behind ``@`` when it happens,
+        if that is not to be drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------

@@ -36,7 +36,7 @@ from lerobot_env_bimanual.so101.env import BiSo101Env
 from lerobot_env_bimanual.so101.expert import teleoperated
 from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
 from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
@@ -114,7 +114,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
     """
     if task not in EXPERTS:
         raise UnknownNameError("task", task, "the recorder", EXPERTS)
-    if task in SUITE:
+    if task in SUITE or task in MORE:
         able = suite_task(task, robot)
         made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
         return Expert(made, lambda seed: of(1, seed)[0], able.objects)
@@ -137,7 +137,7 @@ ALONE = {
     "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperated),
 }
 #: What can be recorded.
-EXPERTS = (*ALONE, *SUITE)
+EXPERTS = (*ALONE, *SUITE, *MORE)
 
 
 def record(

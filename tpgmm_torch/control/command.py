@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.control.gates import Gates
 from tpgmm_torch.control.locate import HELD, Progress
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -29,9 +30,9 @@ class Status(StrEnum):
     """Whether a robot follows its skill; in tensors by its ``code``."""
 
     RUNNING = "running"  #: the skill goes on
-    WAITING = "waiting"  #: a joint does not follow its reference
+    WAITING = "waiting"  #: for a joint that does not follow, or for the end of a skill
     DISPLACED = "displaced"  #: somebody else has moved it
-    HOLDING = "holding"  #: it stands, because what came in cannot be trusted
+    HOLDING = "holding"  #: it stands: inputs cannot be trusted, or it has tried in vain
     FINISHED = "finished"  #: it stands at the end of the skill
 
     @property
@@ -217,6 +218,7 @@ def statuses(
     held: Sequence[tuple[Flags | None, str]],
     halted: Flags | None,
     inputs: Inputs | None,
+    gates: Gates | None = None,
 ) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
     """The status of each robot, and why one does not simply run.
 
@@ -237,10 +239,16 @@ def statuses(
         Robots without accepted inputs.
     inputs : Inputs, optional
         Why that is so.
+    gates : Gates, optional
+        What robots wait for at the end of a skill.
     """
     codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    if gates is not None and gates.reasons:
+        texts = dict(gates.reasons)
+        codes[list(texts)] = Status.WAITING.code
+        codes[gates.failed] = Status.HOLDING.code
     if progress.waits.any():
-        texts = _waiting(progress, names, wanted, inputs)
+        texts |= _waiting(progress, names, wanted, inputs)
         codes[progress.waits] = Status.WAITING.code
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
     if ended is not None:

@@ -8,6 +8,9 @@ sense
 locate
     each robot's time in the skill, and whether it follows (:mod:`~tpgmm_torch.control.locate`,
     :mod:`~tpgmm_torch.sensing.servo`, :mod:`~tpgmm_torch.control.places`)
+gate
+    robots that wait until a skill of a sequence may begin, or go back
+    (:mod:`~tpgmm_torch.control.gates`)
 hold
     objects that move with a hand (:mod:`~tpgmm_torch.control.hold`)
 touch
@@ -53,6 +56,7 @@ from tpgmm_torch.control import command as commands
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.control.command import Command
 from tpgmm_torch.control.estimate import choose, estimate
+from tpgmm_torch.control.gates import Gates, Moment
 from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
@@ -224,10 +228,13 @@ class Controller:
     def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
         self._places, rows = Places(self._skill, begin, end), _rows(as_array(start))
         time = np.full(len(rows), begin, np.float64)
+        self._gates = Gates.start(self._skill.gates, time, end, self._trusts)
         if clock.kind == "localizing" and clock.initial == "anywhere":
+            before = replace(self._places, end=min(end, float(self._gates.stop[0])))
             for row in range(len(rows)):
-                time[row] = self._places.first(row, self.holding, start)
-        self._progress = Progress.start(clock, time, end, rows)
+                time[row] = before.first(row, self.holding, start)
+        progress = Progress.start(clock, time, end, rows)
+        self._progress = replace(progress, stop=self._gates.stop)
         # robots that begin in the middle of the skill stand where no demonstration starts
         midway = torch.from_numpy(time > begin + START * (end - begin))
         midway = midway.view(start.shape[:-1]).to(start.device)
@@ -322,6 +329,7 @@ class Controller:
             return self.command
         self._sense(tick, joints, frames, self._touched(tick, wrenches, ages))
         self._locate(tick)
+        self._gate(tick)
         tick.time = self.time
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
@@ -460,8 +468,48 @@ class Controller:
 
     def _find(self, row: int, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""
-        now = float(self._progress.time[row])
-        return self._places.find(row, posture, now, self.holding, self.reference.detach())
+        now, gates = float(self._progress.time[row]), self._gates
+        within = float(gates.since[row]), float(gates.stop[row])
+        like = self.reference.detach()
+        return self._places.find(row, posture, now, self.holding, like, within)
+
+    def _gate(self, tick: _Tick) -> None:
+        """Robots that wait for the end of one skill to be what the next one needs."""
+        if tick.first or not self._gates.gates:
+            return
+        progress, postures = self._progress, self._postures(tick, measured=True)
+        passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
+        ready = progress.mode == RUNNING
+        for robots in (tick.halted, tick.late):
+            ready = ready if robots is None else ready & ~robots
+        moment = None
+        if self._inputs is not None or not self._trusts:
+            moment = self._moment(tick, postures)
+        self._gates = gates = self._gates.advance(progress.time, passed, ready, moment)
+        self._progress = progress.gated(gates.stop, gates.goto)
+        begin, back = (self._tensor(each) for each in (gates.fade > 0, gates.returned))
+        if begin.any():  # a skill begins with objects where they are now
+            self._holds = self._holds.restarted(begin, postures)
+            self._fade = self._fade.again(begin, self._tensor(gates.fade))
+        if back.any():
+            self._holds = self._holds.released(back, postures, self._frames)
+            self._resume(gates.returned)
+
+    def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
+        """What the conditions of gates are asked of."""
+        reference, velocity = self.reference.detach(), self._following.velocity.detach()
+        readings = torch.nan * reference if tick.joints is None else tick.joints
+        arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
+        arrived = self._tensor(self._progress.arrived(*arrays))
+        none = torch.zeros_like(reference[..., 0], dtype=torch.bool)
+        unseen: dict[str, Tensor] = {}
+        if self._inputs is not None:
+            unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
+            unseen |= self._inputs.lost
+        return Moment(
+            self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
+            self.holding, getattr(self, "contacts", {}), arrived,
+        )  # fmt: skip
 
     def _hold(self, tick: _Tick, frames: Any, holds: Any) -> None:
         """What the robots hold."""
@@ -556,7 +604,7 @@ class Controller:
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
             ((lost, NO_ANSWER), (tick.late, NOT_INCREASED)),
-            tick.halted, self._inputs,
+            tick.halted, self._inputs, self._gates,
         )  # fmt: skip
         self.command = Command(
             following.reference,

@@ -469,6 +469,11 @@ class Regression:
         """See :attr:`Skill.carried_names`."""
         return carried_objects(self.operators, self.kinematics)
 
+    @property
+    def gates(self) -> tuple[()]:
+        """See :attr:`Skill.gates`."""
+        return ()
+
     @cached_property
     def _likelihoods(self) -> dict[bytes, TimeLikelihood]:
         return {}

@@ -18,6 +18,7 @@ from tpgmm_torch.operators.wrench import ExpectedForce
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.gate import Gate
 
 __all__ = ["CompositeSkill", "Skill"]
 
@@ -59,6 +60,11 @@ class Skill(Protocol):
     @property
     def holds(self) -> tuple[Hold, ...]:
         """Intervals in which a link holds an object."""
+        return ()
+
+    @property
+    def gates(self) -> tuple[Gate, ...]:
+        """Times beyond which the skill does not go on until conditions are met, ascending."""
         return ()
 
     @property

@@ -1,0 +1,323 @@
+"""Stage *gate*: robots that wait at a time of their skill, go on, go back, or give up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_torch.control.hold import LOST, LOST_TIME, LOST_TURN
+from tpgmm_torch.control.holding import MOVED, Holding, choose
+from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.sensing.servo import Flags
+from tpgmm_torch.skills.gate import CONTACT, Condition, Gate
+
+__all__ = ["Gates", "Grip", "Moment"]
+
+#: Share of its way with a hand by which an object that is held may be off, as of holds that
+#: are found in how objects move.
+SHARE = 0.4
+#: While conditions are met for less than :data:`LOST_TIME`.
+SURE = "until that is certain"
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What conditions are asked of, at one tick.
+
+    Parameters
+    ----------
+    time : Tensor of shape () or (...)
+        In the skill [s].
+    state : RobotState
+        Of the joints as they are measured, or as they should be where nothing is.
+    reference : Tensor of shape (..., n_joints)
+        [rad or m].
+    frames : mapping of str to Frame
+        Where objects are seen, or were seen last.
+    unseen : mapping of str to Tensor of bool of shape (...)
+        Which robots do not see an object now; objects that were given at the start alone are
+        seen by none.
+    holding : Holding
+        What the robots hold.
+    contacts : mapping of str to Tensor of bool of shape (...)
+        Links whose contact is measured.
+    arrived : Tensor of bool of shape (...)
+        Robots whose joints are where the reference is, at rest.
+    """
+
+    time: Tensor
+    state: RobotState
+    reference: Tensor
+    frames: Mapping[str, Frame]
+    unseen: Mapping[str, Tensor]
+    holding: Holding
+    contacts: Mapping[str, Tensor]
+    arrived: Tensor
+
+    @property
+    def no_robot(self) -> Tensor:
+        """False (...)."""
+        return self.arrived & False
+
+    def hidden(self, name: str) -> Tensor:
+        """Robots (...) that do not see an object now."""
+        return self.no_robot | self.unseen.get(name, self.no_robot)
+
+
+@dataclass(frozen=True, eq=False)
+class Grip:
+    """A link and an object from when the link took it, of each robot.
+
+    Parameters
+    ----------
+    link, thing : Frame
+        Their poses then.
+    holds : Tensor of bool of shape (...)
+        Whether it is to hold it now.
+    carries : Tensor of bool of shape (...)
+        Whether the object was last seen where the link carries it.
+    """
+
+    link: Frame
+    thing: Frame
+    holds: Tensor
+    carries: Tensor
+
+    def update(self, hold: Hold, moment: Moment) -> Self:
+        """After a tick."""
+        link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
+        index, held = moment.holding.kinematics.links.index(hold.link), moment.holding.held
+        holds = moment.no_robot
+        if hold.frame in held:
+            holds = holds | (held[hold.frame].carrier.to(holds.device) == index)
+        new = holds & ~self.holds
+        grip = replace(
+            self, link=choose(new, link, self.link), thing=choose(new, thing, self.thing)
+        )
+        there = grip.carried(hold, moment)
+        off, way = (one.change(there, LOST, LOST_TURN) for one in (thing, grip.thing))
+        along = (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
+        known = torch.where(moment.hidden(hold.frame), self.carries & ~new, along)
+        return replace(grip, holds=holds, carries=holds & known)
+
+    def kept(self, robots: Tensor) -> Self:
+        """For some robots (...) alone."""
+        return replace(self, holds=self.holds & robots, carries=self.carries & robots)
+
+    def carried(self, hold: Hold, moment: Moment) -> Frame:
+        """Where the object would be if the link had it from then on."""
+        return moment.state.pose(hold.link).compose(self.thing.seen_from(self.link))
+
+
+@dataclass(frozen=True, eq=False)
+class Gates:
+    """Where B robots are among the gates of a skill; immutable.
+
+    Parameters
+    ----------
+    gates : tuple of Gate
+    closed : array of shape (G + 1,)
+        Time beyond which robots do not go, by the number of gates behind them [s].
+    index : int array of shape (B,)
+        That number.
+    waited, met_for : array of shape (B,)
+        For how long they have stood at a gate, and its conditions were met [s].
+    tries : int array of shape (B, G)
+        How often that took too long.
+    failed : bool array of shape (B,)
+        Robots that have given up.
+    goto, fade : array of shape (B,)
+        Where the time of robots is set to at this tick, NaN if it is not, and how long it takes
+        to the beginning of a separate skill, 0 if none begins [s].
+    reasons : mapping of int to str
+        What robots wait for, or why they gave up.
+    grips : mapping of Hold to Grip
+        Of the objects that conditions ask for.
+    """
+
+    gates: tuple[Gate, ...]
+    closed: Array
+    index: NDArray[np.int_]
+    waited: Array
+    met_for: Array
+    tries: NDArray[np.int_]
+    failed: Flags
+    goto: Array
+    fade: Array
+    reasons: Mapping[int, str] = MappingProxyType({})
+    grips: Mapping[Hold, Grip] = MappingProxyType({})
+
+    @classmethod
+    def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:
+        """At times (B,) of a skill; without enforcement all conditions count as met."""
+        known = tuple(gate for gate in gates if time.min() < gate.time <= end)
+        last = np.nextafter(end, -np.inf)  # at the end itself a robot is done
+        stops = [min(g.time, last) if enforced and g.until else np.inf for g in known]
+        closed = np.minimum.accumulate([np.inf, *stops[::-1]])[::-1]
+        zero, tries = np.zeros(len(time)), np.zeros((len(time), len(known)), int)
+        none = zero > 0
+        return cls(known, closed, none.astype(int), zero, zero, tries, none, zero, zero)
+
+    @property
+    def stop(self) -> Array:
+        """Times beyond which robots do not go (B,) [s]."""
+        return self.closed[self.index]
+
+    @property
+    def since(self) -> Array:
+        """Beginnings of the skills in which robots are (B,) [s]."""
+        return np.array([-np.inf, *(gate.time + gate.fade for gate in self.gates)])[self.index]
+
+    @property
+    def returned(self) -> Flags:
+        """Robots that go back at this tick."""
+        return np.isfinite(self.goto) & (self.fade == 0)
+
+    def advance(self, time: Array, dt: Array, ready: Flags, moment: Moment | None) -> Self:
+        """After a tick.
+
+        Parameters
+        ----------
+        time : array of shape (B,)
+            In the skill [s].
+        dt : array of shape (B,)
+            Duration of the tick [s].
+        ready : bool array of shape (B,)
+            Robots that follow their references, of which inputs are accepted.
+        moment : Moment, optional
+            What is known; without it, as when somebody looks ahead, gates stay as they are.
+        """
+        new = replace(self, goto=np.full_like(time, np.nan), fade=np.zeros_like(time))
+        for number, gate in enumerate(self.gates):  # those without conditions
+            if self.closed[number] > gate.time:
+                rows = (new.index == number) & (time > gate.time)
+                new = new._opened(rows, np.maximum(time, gate.onward))
+        stands = time >= new.stop
+        at = stands & ready & ~self.failed
+        waited = np.where(at, new.waited + dt, stands * new.waited)
+        if moment is None:
+            met_for = np.where(at & (new.met_for > 0), new.met_for + dt, new.met_for)
+            return replace(new, waited=waited, met_for=met_for)
+        new = replace(
+            new, grips=new._gripped(moment), waited=waited, met_for=stands * new.met_for
+        )
+        kept = {row: text for row, text in self.reasons.items() if stands[row] and not at[row]}
+        return new._decided(at, dt, moment, kept) if stands.any() else replace(new, reasons={})
+
+    def _opened(self, rows: Flags, time: Any) -> Self:
+        """Some robots have passed the next gate, and go on from a time."""
+        if not rows.any():
+            return self
+        fades = np.where(rows, np.array([*(g.fade for g in self.gates), 0.0])[self.index], 0)
+        return replace(
+            self,
+            index=self.index + rows,
+            fade=self.fade + fades,
+            goto=np.where(fades > 0, time, self.goto),
+        )
+
+    def _gripped(self, moment: Moment) -> Mapping[Hold, Grip]:
+        """The links and objects that conditions ask for."""
+        grips = dict(self.grips)
+        for hold in (hold for gate in self.gates for hold in gate.watched):
+            if hold.frame in moment.frames:
+                if hold not in grips:
+                    link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
+                    grips[hold] = Grip(link, thing, moment.no_robot, moment.no_robot)
+                grips[hold] = grips[hold].update(hold, moment)
+        return grips
+
+    def _decided(self, at: Flags, dt: Array, moment: Moment, reasons: dict[int, str]) -> Self:
+        """Robots at their gates wait, go on, go back, or give up."""
+        met_for, tries, failed = self.met_for.copy(), self.tries.copy(), self.failed.copy()
+        opens, goto, waited = at & False, self.goto.copy(), self.waited.copy()
+        for number in np.unique(self.index[at]).tolist():
+            gate = self.gates[number]
+            unmet = {_name(each): self._unmet(each, gate, moment) for each in gate.until}
+            for row in np.flatnonzero(at & (self.index == number)).tolist():
+                first = next((name for name, why in unmet.items() if why[row]), None)
+                met_for[row] = 0.0 if first else met_for[row] + dt[row]
+                reasons[row] = f"{first!r} not met: {unmet[first][row]}" if first else SURE
+                opens[row] = met_for[row] >= LOST_TIME
+                if first and waited[row] >= gate.timeout:
+                    tries[row, number] += 1
+                    count = int(tries[row, number])
+                    failed[row] = count > gate.retries
+                    goto[row] = np.nan if failed[row] else gate.back
+                    after = f" after {count} tries" if count > 1 else ""
+                    reasons[row] = reasons[row].replace(" not met", f" not met{after}", 1)
+        back = np.isfinite(goto) & at
+        moved, times = back | opens, [gate.time for gate in self.gates]
+        kept = torch.from_numpy(~back).view(moment.arrived.shape)
+        new = replace(
+            self,
+            index=np.where(back, np.searchsorted(times, goto, side="right"), self.index),
+            waited=np.where(moved, 0.0, waited),
+            met_for=np.where(moved, 0.0, met_for),
+            tries=tries,
+            failed=failed,
+            goto=goto,
+            reasons={row: text for row, text in reasons.items() if not moved[row]},
+            grips={hold: grip.kept(kept) for hold, grip in self.grips.items()},
+        )
+        onward = np.array([*(gate.onward for gate in self.gates), np.inf])[self.index]
+        return new._opened(opens, onward)
+
+    def _unmet(self, condition: Condition, gate: Gate, moment: Moment) -> list[str]:
+        """Why a condition is not met by each robot (B,); empty where it is."""
+        if condition in ("held", "free"):
+            holds = gate.held if condition == "held" else gate.freed
+            each = [self._not_held(hold, moment, condition == "free") for hold in holds]
+            return [next(filter(None, texts), "") for texts in zip(*each, strict=True)]
+        why, met = "it is false", moment.no_robot
+        if condition == "arrived":
+            why, met = "joints move, or are not at their reference", moment.arrived
+        elif isinstance(condition, str):
+            link = condition.removeprefix(CONTACT)
+            why = f"{link} touches nothing"
+            if link not in moment.contacts:
+                why = "no contact is measured there"
+            met = moment.contacts.get(link, met)
+        else:
+            try:
+                met = torch.as_tensor(condition(moment), dtype=torch.bool)
+            except Exception as error:  # of a user's function, which must not stop the loop
+                why = f"it raised {error!r}"
+        return ["" if one else why for one in _rows(met.expand(moment.arrived.shape))]
+
+    def _not_held(self, hold: Hold, moment: Moment, free: bool) -> list[str]:
+        """Why an object is not held, or not free, by each robot (B,)."""
+        name, grip = hold.frame, self.grips.get(hold)
+        if grip is None:
+            return [f"{name} is nowhere"] * moment.arrived.numel()
+        there, seen = grip.carried(hold, moment), moment.frames[name]
+        hidden = moment.hidden(name)
+        lost = there.change(seen, LOST, LOST_TURN) >= 1
+        met = ~grip.holds & ~hidden & lost if free else grip.carries
+        apart = (there.position - seen.position).norm(dim=-1)
+        table = (each.expand(met.shape) for each in (met, hidden, apart))
+        return [
+            "" if ok
+            else f"{name} is not seen" if gone
+            else f"{name} is {1e3 * away:.0f} mm from where {hold.link} would carry it"
+            for ok, gone, away in zip(*map(_rows, table), strict=True)
+        ]  # fmt: skip
+
+
+def _name(condition: Condition) -> str:
+    return condition if isinstance(condition, str) else getattr(condition, "__name__", "it")
+
+
+def _rows(values: Tensor) -> Any:
+    """Values (...) of robots in one dimension."""
+    return values.numpy(force=True).reshape(-1)
