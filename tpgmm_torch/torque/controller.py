@@ -1,0 +1,405 @@
+"""A running skill for robots with torque control: forces, poses and postures in one product.
+
+A tick is that of a :class:`~tpgmm_torch.Controller`, whose inputs, clock, held objects and status
+are the same, and one stage more, *drive*: the torque at the measured state, its fading, and its
+limits.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.control.command import Command, Status
+from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
+from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
+from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.torque.dynamics import Dynamics
+from tpgmm_torch.torque.gains import TorqueGains
+from tpgmm_torch.torque.rows import (
+    LocalGaussians,
+    Mechanics,
+    fastest,
+    force_rows,
+    fused_torque,
+    jacobians,
+    joint_rows,
+)
+
+__all__ = ["TorqueCommand", "TorqueController"]
+
+#: Time in which the torque of the skill fades when a state is not known [s]: some ticks that
+#: are lost do nothing, and an arm of 1 rad/s moves by less than 3 degrees.
+FADING_TIME = 0.05
+#: Fastest pace of a skill's time that is fed forward: a clock that catches up goes no faster.
+FASTEST_PACE = 2.0
+#: Longest tick, in units of the shortest time constant of the damping: sampled and held, damping
+#: is of no use at 1 and unstable at 2, and contact takes half of the margin.
+LONGEST_TICK = 0.5
+#: Time constant with which integrals of forces fade where there is no contact [s].
+RELEASE_TIME = 0.5
+
+NO_WRENCH = (
+    "the skill expects forces, and the first step has no wrench: forces are not corrected by "
+    "what is measured. Give wrenches={link: (..., 6)}, or TorqueGains(integral=0)"
+)
+NO_JOINTS = "joints were not read at this step"
+NO_VELOCITIES = "velocities are missing or not finite: step(dt, joints, velocities=...)"
+NO_TORQUE = "there is no finite torque here (inertia, bias or frames)"
+LONG_TICK = (
+    "a tick of {dt:.3g} ms is too long for the damping, which takes {longest:.3g} ms at most: "
+    "run at {rate:.0f} Hz or more, or with lower TorqueGains"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueCommand(Command):
+    """What is sent to robots with torque control.
+
+    Parameters
+    ----------
+    torque : Tensor of shape (..., n_joints)
+        Of each joint, gravity and the bias of the motion included [N m or N].
+    **command
+        As for :class:`~tpgmm_torch.control.command.Command`.
+    """
+
+    torque: Tensor = field(kw_only=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What is remembered of the last tick; immutable.
+
+    Parameters
+    ----------
+    joints : Tensor of shape (..., n_joints)
+        Last known ones.
+    fused, bias : Tensor of shape (..., n_joints)
+        Torque of the skill beside the bias, and the bias.
+    share : Tensor of shape (...)
+        How far that torque has faded in, from 0 to 1.
+    time : Tensor of shape (...)
+        In the skill [s].
+    dt : Tensor of shape (...)
+        Duration of the last tick that had one [s].
+    integrals : mapping of Wrench to Tensor of shape (..., n_axes)
+        Of the errors of forces [N].
+    """
+
+    joints: Tensor
+    fused: Tensor
+    bias: Tensor
+    share: Tensor
+    time: Tensor
+    dt: Tensor
+    integrals: Mapping[Wrench, Tensor] = field(default_factory=dict)
+
+
+class TorqueController(Controller):
+    """A batch of robots with torque control that run a skill.
+
+    Where the skill expects forces (:class:`~tpgmm_torch.operators.Wrench`), all its operators
+    speak of torques, and their product decides, joint by joint and instant by instant, between
+    posture, pose and force. A skill without forces is followed with the stiffness of
+    :class:`~tpgmm_torch.impedance.stiffness.Impedance`, firm where demonstrations agree.
+
+    Torques begin as those that carry the robot, and the skill fades in. Without a measured
+    state, or with a tick that is too long for the damping, they fade to gravity and damping,
+    with a reason in the command. They are within the limits of effort, and finite.
+
+    Parameters
+    ----------
+    skill : Skill
+    joints : array-like of shape (..., n_joints)
+        The start postures.
+    frames : mapping of str to Frame, optional
+    dynamics : Dynamics
+        Inertia and bias: a :class:`~tpgmm_torch.torque.MujocoDynamics`, or a function.
+    gains : TorqueGains, optional
+    effort : array-like of shape (n_joints,), optional
+        Largest torques [N m or N]; by default those of the dynamics.
+    **settings
+        As for :class:`~tpgmm_torch.Controller`; ``blend`` is also how long the skill's torque
+        fades in. References are not moved by forces: ``admittance`` is None.
+
+    Raises
+    ------
+    DataError, ShapeError
+        If the skill has operators without rows of torques, the dynamics do not fit the robot,
+        or as for :class:`~tpgmm_torch.Controller`.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        joints: Any,
+        frames: Mapping[str, Frame] | None = None,
+        *,
+        dynamics: Dynamics,
+        gains: TorqueGains = TorqueGains(),  # noqa: B008  (frozen)
+        effort: Any = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(skill, joints, frames, **{"admittance": None} | settings)
+        self._dynamics, self._gains = dynamics, gains
+        self._blend = float(settings.get("blend", 1.0))
+        start = self.reference
+        expected = self._skill.expected_forces(self.time)
+        self._gaussians = None
+        if expected and isinstance(self._skill, Regression):
+            self._gaussians = LocalGaussians(self._skill, gains)
+        self._bodies = (
+            tuple((one.operator.link, None, False) for one in expected)
+            if self._gaussians is None
+            else self._gaussians.bodies
+        )
+        self._effort = self._limits_of(effort, start)
+        zero, n = torch.zeros_like(start), start.shape[-1]
+        inertia, bias = dynamics(start, zero)
+        if inertia.shape != (*start.shape, n) or bias.shape != start.shape:
+            raise ShapeError(
+                f"dynamics give an inertia {(*start.shape, n)} and a bias {tuple(start.shape)}, "
+                f"got {tuple(inertia.shape)} and {tuple(bias.shape)}"
+            )
+        at = jacobians(self._bodies, self._state(start), self.holding.frames)
+        first = Mechanics.at(inertia, at, zero, gains)
+        self._stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(first.mobility)
+        none = zero.sum(-1)
+        self._drive = Drive(start, zero, bias, none, self.time + none, none)
+        self._tick: Any = None
+
+    def _limits_of(self, effort: Any, like: Tensor) -> Tensor:
+        """Largest torques (n_joints,)."""
+        if effort is None:
+            effort = getattr(self._dynamics, "effort", None)
+        if effort is None:
+            effort = torch.full_like(like[..., :1], torch.inf).flatten()[:1].expand(like.shape[-1])
+        limits = as_tensor(effort, "effort").to(like)
+        if limits.shape != like.shape[-1:] or not bool((limits > 0).all()):
+            raise DataError(
+                f"effort has a torque above 0 for each of {like.shape[-1]} joints, got {effort!r}"
+            )
+        return limits
+
+    def step(
+        self,
+        dt: float | Tensor,
+        joints: Any = None,
+        frames: Mapping[str, Any] | None = None,
+        *,
+        velocities: Any = None,
+        holds: Mapping[str, str | None] | None = None,
+        ages: Mapping[str, float] | None = None,
+        wrenches: Mapping[str, Any] | None = None,
+    ) -> TorqueCommand:
+        """Find the next torque.
+
+        Parameters
+        ----------
+        dt : float or Tensor of shape (...)
+            Seconds since the last step.
+        joints, velocities : array-like of shape (..., n_joints)
+            Measured [rad or m], [rad/s or m/s]. Robots without them are held.
+        frames, holds, ages, wrenches
+            As for :meth:`Controller.step`.
+
+        Returns
+        -------
+        TorqueCommand
+
+        Raises
+        ------
+        ShapeError, UnknownNameError
+            As for :meth:`Controller.step`.
+        """
+        self._tick = None
+        command = super().step(dt, joints, frames, holds=holds, ages=ages, wrenches=wrenches)
+        tick, like = self._tick, self.reference
+        if tick is not None and tick.first and self._integrates and not wrenches:
+            warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
+        speeds = self._reading(velocities, "velocities")
+        known = torch.full_like(like, torch.nan)
+        if tick is not None and tick.joints is not None:
+            known = tick.joints
+            if self._gripping is not None:
+                known = torch.where(self._gripping, self._reading(joints, "joints"), known)
+        self.command = driven = self._driven(command, tick, known, speeds)
+        return driven
+
+    def _send(self, tick: Any) -> Command:
+        """Keeps the tick for the torques."""
+        self._tick = tick
+        return super()._send(tick)
+
+    @property
+    def _integrates(self) -> bool:
+        return self._gains.integral > 0 and bool(self._skill.expected_forces(self.time))
+
+    def _reading(self, values: Any, name: str) -> Tensor:
+        """Numbers (..., n_joints), which need not be finite."""
+        like = self.reference
+        if values is None:
+            return torch.full_like(like, torch.nan)
+        given = torch.as_tensor(values).to(like)
+        if given.shape != like.shape:
+            raise ShapeError(
+                f"{name} have shape {tuple(like.shape)} as the joints of the start, got "
+                f"{tuple(given.shape)}"
+            )
+        return given
+
+    # Stage drive
+
+    def _driven(
+        self, command: Command, tick: Any, joints: Tensor, velocities: Tensor
+    ) -> TorqueCommand:
+        """The command with torques."""
+        last, batch = self._drive, self.reference.shape[:-1]
+        dt = last.dt
+        if tick is not None:
+            dt = torch.as_tensor(tick.seconds).to(joints).expand(batch)
+        is_read, moves = (x.isfinite().all(-1) for x in (joints, velocities))
+        joints = torch.where(is_read.unsqueeze(-1), joints, last.joints)
+        velocities = torch.where(moves.unsqueeze(-1), velocities, 0.0)
+        faults = [(~moves, NO_VELOCITIES), (~is_read, NO_JOINTS)]
+        faults.append((command.of(Status.HOLDING), ""))
+        found = self._torques(command, joints, velocities, dt)
+        finite = found.fused.isfinite().all(-1) & found.bias.isfinite().all(-1)
+        faults += [(~finite, NO_TORQUE), (dt * found.rate > LONGEST_TICK, LONG_TICK)]
+        stopped = torch.stack([where for where, _ in faults]).any(0)
+        fused = torch.where(stopped.unsqueeze(-1), last.fused, found.fused)
+        bias = torch.where(finite.unsqueeze(-1), found.bias, last.bias)
+        held = torch.where(found.held.isfinite(), found.held, 0.0)
+        rise = dt / self._blend if self._blend > 0 else torch.ones_like(dt)
+        share = last.share + torch.where(stopped, -dt / FADING_TIME, rise)
+        share = share.clamp(0.0, 1.0)
+        weight = (share**3 * (10 + share * (6 * share - 15))).unsqueeze(-1)
+        asked = bias + weight * fused + (1 - weight) * held
+        torque = asked.clamp(-self._effort, self._effort)
+        free = ~stopped & (asked == torque).all(-1)
+        self._drive = Drive(
+            joints, fused, bias, share, command.time.expand(batch), dt,
+            self._integrated(last.integrals, found.expected, torch.where(free, dt, 0.0), dt),
+        )  # fmt: skip
+        values = {one.name: getattr(command, one.name) for one in fields(Command)}
+        return TorqueCommand(**values | _faults(command, faults, dt, found.rate), torque=torque)
+
+    def _torques(
+        self, command: Command, joints: Tensor, velocities: Tensor, dt: Tensor
+    ) -> Found:
+        """Torques at a state; not a number where there are none."""
+        inertia, bias = self._dynamics(joints, velocities)
+        try:
+            return self._fused(command, joints, velocities, dt, inertia, bias)
+        except TPGMMError:
+            if command is None or self._drive.share.any() == 0 and not self._drive.dt.any():
+                raise
+        lost = torch.full_like(joints, torch.nan)
+        return Found(lost, bias, lost, torch.zeros_like(dt))
+
+    def _fused(
+        self,
+        command: Command,
+        joints: Tensor,
+        velocities: Tensor,
+        dt: Tensor,
+        inertia: Tensor,
+        bias: Tensor,
+    ) -> Found:
+        state, frames = self._state(joints), self.holding.frames
+        at = jacobians(self._bodies, state, frames)
+        mechanics = Mechanics.at(inertia, at, velocities, self._gains, self._stiffness)
+        held = -(mechanics.joint_damping @ velocities.unsqueeze(-1)).squeeze(-1)
+        expected = self._skill.expected_forces(command.time)
+        estimate, rate = command.estimate, mechanics.rate
+        error, moving = command.reference - joints, command.velocity - velocities
+        if not self._bodies:
+            stiffness = command.stiffness_matrix
+            assert self._impedance is not None
+            damping = self._impedance.joints.damping(stiffness, inertia)
+            fused = stiffness @ error.unsqueeze(-1) + damping @ moving.unsqueeze(-1)
+            return Found(fused.squeeze(-1), bias, held, torch.maximum(rate, fastest(mechanics.inverse @ damping)))
+        if self._gaussians is not None:
+            passed = torch.where(dt > 0, (command.time - self._drive.time) / dt, 0.0)
+            pace = passed.clamp(0.0, FASTEST_PACE)
+            rows = self._gaussians.rows(command.time, pace, state, frames, mechanics)
+        else:
+            rows = joint_rows(estimate.joints - joints, moving, estimate.covariance, mechanics)
+        forces = force_rows(
+            expected, self._drive.integrals, self._bodies, state, frames, mechanics, self._gains
+        )
+        rate = torch.stack([rate, *(one.rate for one in forces)]).amax(0)
+        return Found(fused_torque([rows, *forces], held, mechanics), bias, held, rate, expected)
+
+    def _integrated(
+        self,
+        before: Mapping[Wrench, Tensor],
+        expected: Sequence[ExpectedForce],
+        passed: Tensor,
+        dt: Tensor,
+    ) -> dict[Wrench, Tensor]:
+        """Integrals of the errors of forces, bounded by the forces, in contact alone."""
+        values = {}
+        for one in expected:
+            reading = self._wrenches.readings.get(one.operator.link)
+            if reading is None:
+                continue
+            pose = one.operator.pose(self._state(self._drive.joints), self.holding.frames)
+            turn = quaternions.conjugate(pose.orientation)
+            force = torch.as_tensor(reading.value[..., :3]).to(passed)
+            felt = quaternions.rotate(turn, force)[..., list(one.operator.axes or ())]
+            fresh = torch.as_tensor(reading.age == 0).to(passed.device)
+            known = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
+            left = torch.exp(-(1 - one.share) * dt / RELEASE_TIME).unsqueeze(-1)
+            value = before.get(one.operator, torch.zeros_like(felt)) * left
+            value = value + self._gains.integral * known * (one.force - felt)
+            most = one.force.norm(dim=-1, keepdim=True)
+            values[one.operator] = value.clamp(-most, most)
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Torques at a state.
+
+    Parameters
+    ----------
+    fused, bias, held : Tensor of shape (..., n_joints)
+        Of the skill beside the bias, the bias, and of a robot that is held, beside the bias.
+    rate : Tensor of shape (...)
+        The fastest rate of the damping [1/s].
+    expected : sequence of ExpectedForce
+    """
+
+    fused: Tensor
+    bias: Tensor
+    held: Tensor
+    rate: Tensor
+    expected: Sequence[ExpectedForce] = ()
+
+
+def _faults(
+    command: Command, faults: Sequence[tuple[Tensor, str]], dt: Tensor, rate: Tensor
+) -> dict[str, Any]:
+    """Codes and reasons of a command, with those of robots that are held by their torques."""
+    codes, reasons = command.codes.clone(), dict(command.reasons)
+    for where, reason in faults:
+        if not reason or not bool(where.any()):
+            continue
+        codes[where] = Status.HOLDING.code
+        for index in map(tuple, where.nonzero().tolist()):
+            longest = LONGEST_TICK / max(float(rate[index]), 1e-9)
+            text = reason.format(dt=1e3 * float(dt[index]), longest=1e3 * longest, rate=1 / longest)
+            reasons.setdefault(index, text)
+    return {"codes": codes, "reasons": reasons}

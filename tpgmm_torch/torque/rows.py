@@ -1,0 +1,496 @@
+r"""Rows of torque space: Gaussians of torques, fused as Gaussians of joints are.
+
+With :math:`\tau = h(q, \dot q) + \tau'` each operator says ``T tau' = y`` with a covariance. All
+rows of one link belong to one dynamically consistent inverse of its six-row Jacobian,
+:math:`T = \Lambda J H^{-1}`, :math:`\Lambda = (J H^{-1} J^T)^{-1}`, so that a force asks for no
+moment; rows of joints have ``T = I``. With the row ``J (q* - q) = M mu + c`` of the paper's
+Table I,
+
+    y = K (M mu + c) + D (M dmu/dt - J qd),   covariance K M Sigma M^T K^T.
+
+J. Silverio, Y. Huang, L. Rozo, S. Calinon, D. G. Caldwell: Probabilistic Learning of Torque
+Controllers from Kinematic and Force Constraints, IROS 2018, arXiv 1712.07249; dynamically
+consistent inverse: O. Khatib, IEEE Journal of Robotics and Automation 3(1), 1987.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians, quaternions
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.impedance.stiffness import geometric_mean
+from tpgmm_torch.operators import (
+    Canonical,
+    Operator,
+    PoseOperator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.operators.base import of_joints
+from tpgmm_torch.operators.pose import linearize_poses
+from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
+from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.torque.gains import TorqueGains
+
+__all__ = ["Body", "LocalGaussians", "Mechanics", "TorqueRows", "force_rows", "fused_torque"]
+
+#: Directions in which links move by less than this share of what their axes suggest are given
+#: up smoothly, as postures become singular (a ratio of eigenvalues, without a unit).
+SINGULAR = 1e-3
+#: Precision of the prior ``PRIOR H^-1`` around the torque that holds a robot [s^-4 in its metric].
+PRIOR = 1e-9
+#: Variance that stands for none at all, of rows between things that no joint moves [m^2, rad^2].
+FREE = 1e12
+#: Smallest share of contact of which a force has an effect.
+LEAST_SHARE = 1e-3
+
+Body = tuple[str, str | None, bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanics:
+    """Stiffness, damping and the inverses ``T`` of joints and links at one state.
+
+    Coordinates are those of the joints, and behind them six of each link (N in all).
+
+    Parameters
+    ----------
+    inertia : Tensor of shape (..., n, n)
+        ``H``.
+    inverse : Tensor of shape (..., n, n)
+        ``H^-1``.
+    mobility : Tensor of shape (..., B, 6, 6)
+        ``J H^-1 J^T`` of each link.
+    consistent : Tensor of shape (..., N, n)
+        ``T``.
+    seen : Tensor of shape (..., N, N)
+        ``T J^T``: the identity, but near singular postures.
+    velocity : Tensor of shape (..., N)
+        ``J qd``.
+    stiffness, damping : Tensor of shape (..., N, N)
+        Block by block.
+    """
+
+    inertia: Tensor
+    inverse: Tensor
+    mobility: Tensor
+    consistent: Tensor
+    seen: Tensor
+    velocity: Tensor
+    stiffness: Tensor
+    damping: Tensor
+
+    @classmethod
+    def at(
+        cls,
+        inertia: Tensor,
+        jacobians: Tensor,
+        velocities: Tensor,
+        gains: TorqueGains,
+        stiffness: tuple[Tensor, Tensor] | None = None,
+    ) -> Mechanics:
+        """At a state.
+
+        Parameters
+        ----------
+        inertia : Tensor of shape (..., n, n)
+        jacobians : Tensor of shape (..., B, 6, n)
+            Of each link.
+        velocities : Tensor of shape (..., n)
+            ``qd``.
+        gains : TorqueGains
+        stiffness : tuple of Tensor of shapes (..., n, n) and (..., B, 6, 6), optional
+            Of joints and links, by default those of the gains for this state.
+        """
+        factor = gaussians.cholesky(inertia, "the inertia of the robot")
+        inverse = torch.cholesky_inverse(factor)
+        accelerations = jacobians @ inverse.unsqueeze(-3)
+        mobility = accelerations @ jacobians.mT
+        masses, seen_six = _inverse(mobility)
+        if stiffness is None:
+            stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(mobility)
+        joint, link = stiffness
+        twice = 2 * gains.damping_ratio
+        eye = torch.eye(inertia.shape[-1]).to(inertia).expand_as(inertia)
+        turned = (jacobians @ velocities[..., None, :, None]).flatten(-3)
+        return cls(
+            inertia,
+            inverse,
+            mobility,
+            torch.cat((eye, (masses @ accelerations).flatten(-3, -2)), -2),
+            _blocks(eye, seen_six),
+            torch.cat((velocities, turned), -1),
+            _blocks(joint, link),
+            _blocks(twice * geometric_mean(inertia, joint), twice * geometric_mean(link, masses)),
+        )
+
+    @property
+    def joint_damping(self) -> Tensor:
+        """``D_q`` (..., n, n)."""
+        n = self.inertia.shape[-1]
+        return self.damping[..., :n, :n]
+
+    @property
+    def rate(self) -> Tensor:
+        """The fastest rate of the damping (...), of joints and links [1/s]."""
+        n = self.inertia.shape[-1]
+        rates = [fastest(self.inverse @ self.joint_damping)]
+        for b in range(self.mobility.shape[-3]):
+            rows = slice(n + 6 * b, n + 6 * b + 6)
+            rates.append(fastest(self.mobility[..., b, :, :] @ self.damping[..., rows, rows]))
+        return torch.stack(rates).amax(0)
+
+
+def _inverse(mobility: Tensor) -> tuple[Tensor, Tensor]:
+    """``L = (J H^-1 J^T)^-1`` (..., 6, 6), and the product of both.
+
+    Directions along which a link hardly moves have eigenvalues ``a`` below :data:`SINGULAR`,
+    once axes are scaled alike: ``a / SINGULAR^2`` in place of ``1 / a`` gives them up.
+    """
+    axes = mobility.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(axes > 0, axes, 1.0).rsqrt()
+    values, vectors = torch.linalg.eigh(scale.unsqueeze(-1) * mobility * scale.unsqueeze(-2))
+    values = values.clamp_min(0)
+    kept = (values / SINGULAR).square().clamp_max(1.0)
+    left = scale.unsqueeze(-1) * vectors
+    masses = left * (kept / torch.where(values > 0, values, 1.0)).unsqueeze(-2) @ left.mT
+    return masses, left * kept.unsqueeze(-2) @ (vectors / scale.unsqueeze(-1)).mT
+
+
+def _blocks(first: Tensor, others: Tensor) -> Tensor:
+    """Matrices (..., n, n) and (..., B, 6, 6) on the diagonal of one."""
+    n, count = first.shape[-1], others.shape[-3]
+    whole = first.new_zeros(*first.shape[:-2], n + 6 * count, n + 6 * count)
+    whole[..., :n, :n] = first
+    for b in range(count):
+        rows = slice(n + 6 * b, n + 6 * b + 6)
+        whole[..., rows, rows] = others[..., b, :, :]
+    return whole
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueRows:
+    """Rows ``T tau' = y``.
+
+    Parameters
+    ----------
+    consistent : Tensor of shape (..., m, n)
+        ``T``.
+    targets : Tensor of shape (..., m)
+        ``y`` [N m or N].
+    covariance : Tensor of shape (..., m, m)
+    rate : Tensor of shape (...), optional
+        Of a damping of its own, beside that of the mechanics [1/s].
+    """
+
+    consistent: Tensor
+    targets: Tensor
+    covariance: Tensor
+    rate: Any = 0.0
+
+
+class LocalGaussians:
+    """The local Gaussians of a mixture's operators over time, mixed, as rows of torques.
+
+    Components are mixed by matching moments operator by operator, which commutes with the
+    affine maps to torques; each operator is its own expert in the product that follows.
+
+    Parameters
+    ----------
+    skill : Regression
+        With operators of joints, and of positions and orientations of links, and their stacks.
+    gains : TorqueGains
+
+    Raises
+    ------
+    DataError
+        If there is an operator of another kind.
+    """
+
+    def __init__(self, skill: Any, gains: TorqueGains) -> None:
+        kinematics: Kinematics = skill.kinematics
+        operators = of_joints(skill.operators)
+        members = leaves(operators)
+        for leaf in members:
+            if not isinstance(leaf, Canonical | PoseOperator):
+                raise DataError(
+                    f"{leaf!r} has no rows in torque space: there are those of Canonical, of "
+                    "positions and orientations, their stacks, and Wrench"
+                )
+        with torch.inference_mode(False):
+            self.conditionals = Conditionals.stacked(skill.fused)
+        self.marginals, self.stack = skill.marginals, Stack(*operators)
+        self._starts = self.stack.quaternion_starts(kinematics)
+        self._kinematics = kinematics
+        forces = [(one.link, None, False) for one in skill.operators if isinstance(one, Wrench)]
+        bodies = [_body(one, kinematics) for one in members if isinstance(one, PoseOperator)]
+        #: What the rows of :class:`Mechanics` are of.
+        self.bodies: tuple[Body, ...] = tuple(dict.fromkeys([*bodies, *forces]))
+        index: list[int] = []
+        self._tangents: list[tuple[int, Any]] = []
+        labels, noise = [], []  # operator, leaf and three coordinates that rows belong to
+        for expert, operator in enumerate(operators):
+            for leaf in leaves([operator]):
+                rows = self._rows(leaf)
+                block = 0 if isinstance(leaf, Canonical) else rows[0]
+                labels += [(expert, len(index), block)] * len(rows)
+                noise += [_tolerance(leaf, kinematics, gains)] * len(rows)
+                if leaf.rotation_vector_starts(kinematics):
+                    self._tangents.append((len(index), leaf))
+                index += rows
+        like = kinematics.lower
+        self.index = torch.tensor(index, device=like.device)
+        self.noise = torch.tensor(noise).to(like).square()
+        expert_of, leaf_of, block_of = torch.tensor(labels).T.unsqueeze(-1)
+        same = expert_of == expert_of.mT
+        # two operators of one stack may both have the position of one link
+        apart = (leaf_of != leaf_of.mT) & (block_of == block_of.mT)
+        self.same_expert, self.coupled = same.to(like), (same & ~apart).to(like)
+
+    def _rows(self, leaf: Operator) -> list[int]:
+        """Where the rows of an operator are among the coordinates of :class:`Mechanics`."""
+        if isinstance(leaf, Canonical):
+            return list(leaf.columns(self._kinematics.joint_names))
+        assert isinstance(leaf, PoseOperator)
+        first = self._kinematics.n_joints + 6 * self.bodies.index(_body(leaf, self._kinematics))
+        return [first + 3 * (leaf.gain is not None) + i for i in range(3)]
+
+    def mixed(self, time: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Means (..., D), their time derivatives and covariances of the local coordinates.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+        present : Tensor of shape (..., D)
+            Present coordinates, to the side of which quaternions are brought.
+        """
+        one, marginals = self.conditionals, self.marginals
+        weights = torch.softmax(marginals.log_activation(time.unsqueeze(-1)), -1)
+        mean, gain, covariance = one.at(time), one.gain, one.covariance
+        if self._starts:
+            signs = quaternions.hemisphere_signs(mean, present.unsqueeze(-2), self._starts)
+            mean, gain = signs * mean, signs * gain
+            covariance = signs[..., None] * covariance * signs[..., None, :]
+        slopes = marginals.precision * (marginals.mean - time.unsqueeze(-1))
+        rates = weights * (slopes - (weights * slopes).sum(-1, keepdim=True))
+        speed = (weights.unsqueeze(-1) * gain + rates.unsqueeze(-1) * mean).sum(-2)
+        center, spread = gaussians.moment_match(weights, mean, covariance)
+        return center, speed, spread
+
+    def rows(
+        self,
+        time: Tensor,
+        pace: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        mechanics: Mechanics,
+    ) -> TorqueRows:
+        """The rows of all operators at a state.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+            In the skill [s].
+        pace : Tensor of shape () or (...)
+            How fast that time passes: 1 as in the demonstrations, 0 where it stands.
+        state : RobotState
+        frames : mapping of str to Frame
+        mechanics : Mechanics
+            Of :attr:`bodies`.
+        """
+        stack = self.stack.at(time)
+        at = stack.linearize(state, frames)
+        present = at.present
+        if present is None:
+            present = stack.coordinates(state, frames) if self._starts else state.joints
+        mean, speed, covariance = self.mixed(time, present)
+        _, matrix = at.dense()
+        mean, speed = matrix @ mean.unsqueeze(-1), matrix @ speed.unsqueeze(-1)
+        step, moving = mean + at.displacement.unsqueeze(-1), pace[..., None, None] * speed
+        if self._tangents:
+            turns = self._turns(at.displacement, state, frames)
+            step, moving, matrix = turns @ step, turns @ moving, turns @ matrix
+        spread = matrix @ covariance @ matrix.mT * self.same_expert
+        noise = self.noise if at.noise is None else self.noise + FREE * at.noise
+        spread = spread + noise.diag_embed()
+        stiffness, damping, seen = (
+            whole[..., self.index, :][..., self.index] * self.coupled
+            for whole in (mechanics.stiffness, mechanics.damping, mechanics.seen)
+        )
+        error = moving - mechanics.velocity[..., self.index, None]
+        targets = seen @ (stiffness @ step + damping @ error)
+        return TorqueRows(
+            mechanics.consistent[..., self.index, :],
+            targets.squeeze(-1),
+            stiffness @ spread @ stiffness.mT,
+        )
+
+    def _turns(
+        self, displacement: Tensor, state: RobotState, frames: Mapping[str, Frame]
+    ) -> Tensor:
+        """From tangent spaces to the base frame, (..., m, m), by the transpose of ``J``'s factor.
+
+        ``J = J_r(y)^-1 R(eps)^T J_o``: the torque of the potential ``k |mu - y|^2 / 2`` is
+        ``J_o^T R(eps) J_r(y)^-T k (mu - y)``, however large the turn.
+        """
+        m = displacement.shape[-1]
+        turns = torch.eye(m).to(displacement).repeat(*displacement.shape[:-1], 1, 1)
+        for at, leaf in self._tangents:
+            rows = slice(at, at + 3)
+            rotation = quaternions.to_matrix(leaf.poses(state, frames)[0].orientation)
+            inverse = quaternions.inverse_left_jacobian(displacement[..., rows])
+            turns[..., rows, rows] = rotation @ inverse.mT
+        return turns
+
+
+def jacobians(bodies: Sequence[Body], state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    """Jacobians (..., B, 6, n) of links and objects, in the base frame.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+    state : RobotState
+    frames : mapping of str to Frame
+    """
+    found = []
+    for link, frame, held in bodies:
+        if frame is not None:
+            place = RelativePosition(link, frame, held=held)
+            turn = RelativeOrientation(link, frame, held=held)
+            jacobian = linearize_poses((place, turn), state, frames).jacobian
+            assert jacobian is not None
+            found.append(jacobian)
+        elif link in state.links:
+            found.append(state.jacobian(link))
+        else:  # an object that is free
+            found.append(torch.zeros_like(state.jacobians[..., 0, :, :]))
+    if not found:
+        return state.jacobians[..., :0, :, :]
+    return torch.stack(torch.broadcast_tensors(*found), -3)
+
+
+def joint_rows(
+    error: Tensor, moving: Tensor, covariance: Tensor, mechanics: Mechanics
+) -> TorqueRows:
+    """Rows of a Gaussian of the joints: ``tau' = K_q error + D_q moving``.
+
+    Parameters
+    ----------
+    error, moving : Tensor of shape (..., n)
+        How far its mean is away, and how much faster it moves.
+    covariance : Tensor of shape (..., n, n)
+    mechanics : Mechanics
+    """
+    n = error.shape[-1]
+    stiffness, damping = mechanics.stiffness[..., :n, :n], mechanics.joint_damping
+    targets = stiffness @ error.unsqueeze(-1) + damping @ moving.unsqueeze(-1)
+    unit = mechanics.consistent[..., :n, :]
+    return TorqueRows(unit, targets.squeeze(-1), stiffness @ covariance @ stiffness.mT)
+
+
+def fastest(rates: Tensor) -> Tensor:
+    """Largest eigenvalue (...) of matrices ``H^-1 D`` (..., m, m) [1/s]."""
+    if rates.shape[-3:-2] == (0,):
+        return rates.new_zeros(rates.shape[:-2])
+    return torch.linalg.eigvals(rates).real.amax(-1)
+
+
+def force_rows(
+    expected: Sequence[ExpectedForce],
+    integrals: Mapping[Wrench, Tensor],
+    bodies: Sequence[Body],
+    state: RobotState,
+    frames: Mapping[str, Frame],
+    mechanics: Mechanics,
+    gains: TorqueGains,
+) -> list[TorqueRows]:
+    r"""Rows of expected forces: along axes ``e``, ``e^T T tau' = f - D_f e^T v + integral``.
+
+    Where only a share :math:`\kappa` of the demonstrations is in contact, the variance grows by
+    :math:`(f_c^2 + c^2) (1 - \kappa) / \kappa`, with :math:`f_c = f / \kappa` the force in contact
+    and ``c`` that at which contact begins: at even odds a force is as uncertain as it is large.
+
+    Parameters
+    ----------
+    expected : sequence of ExpectedForce
+    integrals : mapping of Wrench to Tensor of shape (..., n_axes)
+        Integrals of the errors of forces [N].
+    bodies : sequence of Body
+        Of the mechanics.
+    state : RobotState
+    frames : mapping of str to Frame
+    mechanics : Mechanics
+    gains : TorqueGains
+    """
+    n, found = state.joints.shape[-1], []
+    for one in expected:
+        share = one.share.clamp_min(LEAST_SHARE)[..., None]
+        operator, body = one.operator, bodies.index((one.operator.link, None, False))
+        axes = quaternions.to_matrix(operator.pose(state, frames).orientation).mT
+        axes = axes[..., list(operator.axes or ()), :]
+        rows = slice(n + 6 * body, n + 6 * body + 3)
+        mobility = mechanics.mobility[..., body, :3, :3]
+        masses = 1 / (axes @ mobility @ axes.mT).diagonal(dim1=-2, dim2=-1)
+        damping = 2 * gains.damping_ratio * (gains.contact_stiffness * masses).sqrt()
+        speed = (axes @ mechanics.velocity[..., rows, None]).squeeze(-1)
+        target = one.force + integrals.get(operator, torch.zeros_like(one.force))
+        target = target - damping * speed
+        force = one.force.square().sum(-1, keepdim=True) / share.square() + operator.contact**2
+        noise = (force * (1 - share) / share).unsqueeze(-1)
+        seen = axes @ mechanics.seen[..., rows, rows] @ axes.mT
+        found.append(
+            TorqueRows(
+                axes @ mechanics.consistent[..., rows, :],
+                (seen @ target.unsqueeze(-1)).squeeze(-1),
+                one.covariance + noise * torch.eye(target.shape[-1]).to(target),
+                (damping / masses).amax(-1),
+            )
+        )
+    return found
+
+
+def fused_torque(rows: Sequence[TorqueRows], held: Tensor, mechanics: Mechanics) -> Tensor:
+    """The mean (..., n) of the product of all rows, and of a prior.
+
+    Parameters
+    ----------
+    rows : sequence of TorqueRows
+    held : Tensor of shape (..., n)
+        Mean of the prior, of precision ``PRIOR H^-1``: the torque of a robot that is held. It
+        counts where no row does.
+    mechanics : Mechanics
+    """
+    precision = PRIOR * mechanics.inverse
+    vector = precision @ held.unsqueeze(-1)
+    for one in rows:
+        more, towards, _ = gaussians.information(
+            one.consistent, one.targets.unsqueeze(-1), one.covariance
+        )
+        precision, vector = precision + more, vector + towards
+    factor = gaussians.cholesky(precision, "the precision of the torques")
+    return torch.cholesky_solve(vector, factor).squeeze(-1)
+
+
+def _body(leaf: PoseOperator, kinematics: Kinematics) -> Body:
+    """A link, or an object, that moves, seen from a place or from another that moves."""
+    link, *held = leaf.links()
+    moving = [*held, *(name for name in leaf.references() if name in kinematics.links)]
+    return link, moving[0] if moving else None, bool(held)
+
+
+def _tolerance(leaf: Operator, kinematics: Kinematics, gains: TorqueGains) -> float:
+    """Standard deviation of the frame that an operator refers to [m or rad]."""
+    frames = {*leaf.links()[1:], *leaf.references()} - {*kinematics.links}
+    if not frames or not isinstance(leaf, PoseOperator):
+        return 0.0
+    return gains.frame_tolerance if leaf.gain is None else gains.frame_turn_tolerance
