@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
+from tpgmm_torch.motion.follower import Follower
+from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.torque.dynamics import Dynamics
@@ -30,7 +31,9 @@ from tpgmm_torch.torque.rows import (
     LocalGaussians,
     Mechanics,
     fastest,
-    force_rows,
+    force_axes,
+    force_bodies,
+    force_row,
     fused_torque,
     jacobians,
     joint_rows,
@@ -85,10 +88,15 @@ class Drive:
     ----------
     joints : Tensor of shape (..., n_joints)
         Last known ones.
-    fused, bias : Tensor of shape (..., n_joints)
-        Torque of the skill beside the bias, and the bias.
-    share : Tensor of shape (...)
-        How far that torque has faded in, from 0 to 1.
+    sent : Tensor of shape (..., n_joints)
+        Torque beside the bias, before limits.
+    offset : Tensor of shape (..., n_joints)
+        Difference from what the skill asked for, when robots began or went on.
+    since : Tensor of shape (...)
+        Time since then [s].
+    stopped : Tensor of bool of shape (...)
+        Robots that are held.
+    bias : Tensor of shape (..., n_joints)
     time : Tensor of shape (...)
         In the skill [s].
     dt : Tensor of shape (...)
@@ -98,9 +106,11 @@ class Drive:
     """
 
     joints: Tensor
-    fused: Tensor
+    sent: Tensor
+    offset: Tensor
+    since: Tensor
+    stopped: Tensor
     bias: Tensor
-    share: Tensor
     time: Tensor
     dt: Tensor
     integrals: Mapping[Wrench, Tensor] = field(default_factory=dict)
@@ -159,11 +169,9 @@ class TorqueController(Controller):
         self._gaussians = None
         if expected and isinstance(self._skill, Regression):
             self._gaussians = LocalGaussians(self._skill, gains)
-        self._bodies = (
-            tuple((one.operator.link, None, False) for one in expected)
-            if self._gaussians is None
-            else self._gaussians.bodies
-        )
+        self._bodies = force_bodies([one.operator for one in expected])
+        if self._gaussians is not None:
+            self._bodies = self._gaussians.bodies
         self._effort = self._limits_of(effort, start)
         zero, n = torch.zeros_like(start), start.shape[-1]
         inertia, bias = dynamics(start, zero)
@@ -176,7 +184,7 @@ class TorqueController(Controller):
         first = Mechanics.at(inertia, at, zero, gains)
         self._stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(first.mobility)
         none = zero.sum(-1)
-        self._drive = Drive(start, zero, bias, none, self.time + none, none)
+        self._drive = Drive(start, zero, zero, none, none == 0, bias, self.time + none, none)
         self._tick: Any = None
 
     def _limits_of(self, effort: Any, like: Tensor) -> Tensor:
@@ -184,7 +192,9 @@ class TorqueController(Controller):
         if effort is None:
             effort = getattr(self._dynamics, "effort", None)
         if effort is None:
-            effort = torch.full_like(like[..., :1], torch.inf).flatten()[:1].expand(like.shape[-1])
+            effort = (
+                torch.full_like(like[..., :1], torch.inf).flatten()[:1].expand(like.shape[-1])
+            )
         limits = as_tensor(effort, "effort").to(like)
         if limits.shape != like.shape[-1:] or not bool((limits > 0).all()):
             raise DataError(
@@ -237,8 +247,31 @@ class TorqueController(Controller):
         self.command = driven = self._driven(command, tick, known, speeds)
         return driven
 
+    # Stages that are others where forces are expected: robots are where they are pushed to
+
+    def _estimate(self, tick: Any) -> Estimate:
+        if self._gaussians is None or self.command is None:
+            return super()._estimate(tick)
+        return self.command.estimate
+
+    def _reach(self, tick: Any, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
+        if self._gaussians is None:
+            return super()._reach(tick, found)
+        return found, self._postures(tick, measured=True), None
+
+    def _follow(
+        self, tick: Any, found: Estimate, wanted: Tensor, fitting: Follower | None
+    ) -> None:
+        if self._gaussians is None:
+            super()._follow(tick, found, wanted, fitting)
+            return
+        self._found, passed = found, torch.as_tensor(tick.seconds).to(wanted).unsqueeze(-1)
+        velocity = (wanted - self.reference) / passed
+        self._following = replace(
+            self._following, reference=wanted, wanted=wanted, velocity=velocity, lost=None
+        )
+
     def _send(self, tick: Any) -> Command:
-        """Keeps the tick for the torques."""
         self._tick = tick
         return super()._send(tick)
 
@@ -278,21 +311,26 @@ class TorqueController(Controller):
         finite = found.fused.isfinite().all(-1) & found.bias.isfinite().all(-1)
         faults += [(~finite, NO_TORQUE), (dt * found.rate > LONGEST_TICK, LONG_TICK)]
         stopped = torch.stack([where for where, _ in faults]).any(0)
-        fused = torch.where(stopped.unsqueeze(-1), last.fused, found.fused)
         bias = torch.where(finite.unsqueeze(-1), found.bias, last.bias)
         held = torch.where(found.held.isfinite(), found.held, 0.0)
-        rise = dt / self._blend if self._blend > 0 else torch.ones_like(dt)
-        share = last.share + torch.where(stopped, -dt / FADING_TIME, rise)
-        share = share.clamp(0.0, 1.0)
-        weight = (share**3 * (10 + share * (6 * share - 15))).unsqueeze(-1)
-        asked = bias + weight * fused + (1 - weight) * held
-        torque = asked.clamp(-self._effort, self._effort)
-        free = ~stopped & (asked == torque).all(-1)
+        left = (1 - dt / FADING_TIME).clamp_min(0.0).unsqueeze(-1)
+        at_rest = held + left * (last.sent - held)
+        # what is sent goes on where it was: the difference fades, as that of postures does
+        begins = last.stopped & ~stopped
+        offset = torch.where(begins.unsqueeze(-1), found.fused - last.sent, last.offset)
+        since = torch.where(begins, 0.0, last.since + dt)
+        share = (since / self._blend).clamp(0.0, 1.0) if self._blend > 0 else since * 0 + 1
+        left = 1 - (share**3 * (10 + share * (6 * share - 15))).unsqueeze(-1)
+        sent = torch.where(stopped.unsqueeze(-1), at_rest, found.fused - left * offset)
+        torque = (bias + sent).clamp(-self._effort, self._effort)
+        free = ~stopped & (bias + sent == torque).all(-1)
         self._drive = Drive(
-            joints, fused, bias, share, command.time.expand(batch), dt,
-            self._integrated(last.integrals, found.expected, torch.where(free, dt, 0.0), dt),
+            joints, sent, offset, since, stopped, bias, command.time.expand(batch), dt,
+            self._integrated(found, torch.where(free, dt, 0.0), dt),
         )  # fmt: skip
         values = {one.name: getattr(command, one.name) for one in fields(Command)}
+        if found.estimate is not None:
+            values["estimate"] = found.estimate
         return TorqueCommand(**values | _faults(command, faults, dt, found.rate), torque=torque)
 
     def _torques(
@@ -303,7 +341,7 @@ class TorqueController(Controller):
         try:
             return self._fused(command, joints, velocities, dt, inertia, bias)
         except TPGMMError:
-            if command is None or self._drive.share.any() == 0 and not self._drive.dt.any():
+            if not bool(self._drive.dt.any()):  # the first step
                 raise
         lost = torch.full_like(joints, torch.nan)
         return Found(lost, bias, lost, torch.zeros_like(dt))
@@ -329,42 +367,50 @@ class TorqueController(Controller):
             assert self._impedance is not None
             damping = self._impedance.joints.damping(stiffness, inertia)
             fused = stiffness @ error.unsqueeze(-1) + damping @ moving.unsqueeze(-1)
-            return Found(fused.squeeze(-1), bias, held, torch.maximum(rate, fastest(mechanics.inverse @ damping)))
+            return Found(
+                fused.squeeze(-1),
+                bias,
+                held,
+                torch.maximum(rate, fastest(mechanics.inverse @ damping)),
+            )
         if self._gaussians is not None:
             passed = torch.where(dt > 0, (command.time - self._drive.time) / dt, 0.0)
             pace = passed.clamp(0.0, FASTEST_PACE)
             rows = self._gaussians.rows(command.time, pace, state, frames, mechanics)
         else:
             rows = joint_rows(estimate.joints - joints, moving, estimate.covariance, mechanics)
-        forces = force_rows(
-            expected, self._drive.integrals, self._bodies, state, frames, mechanics, self._gains
-        )
+        axes = [force_axes(one.operator, state, frames) for one in expected]
+        forces = [
+            force_row(
+                one, along, self._drive.integrals.get(one.operator, 0.0),
+                list(self._bodies).index((one.operator.link, None, False)), mechanics, self._gains,
+            )
+            for one, along in zip(expected, axes, strict=True)
+        ]  # fmt: skip
         rate = torch.stack([rate, *(one.rate for one in forces)]).amax(0)
-        return Found(fused_torque([rows, *forces], held, mechanics), bias, held, rate, expected)
+        fused, covariance = fused_torque([rows, *forces], held, mechanics)
+        if self._gaussians is not None:
+            compliance = torch.linalg.inv(self._stiffness[0])
+            joints = joints + (compliance @ fused.unsqueeze(-1)).squeeze(-1)
+            spread = compliance @ covariance @ compliance
+            estimate = Estimate(joints, spread, self._skill.weights_at(command.time))
+        return Found(fused, bias, held, rate, expected, axes, estimate)
 
-    def _integrated(
-        self,
-        before: Mapping[Wrench, Tensor],
-        expected: Sequence[ExpectedForce],
-        passed: Tensor,
-        dt: Tensor,
-    ) -> dict[Wrench, Tensor]:
-        """Integrals of the errors of forces, bounded by the forces, in contact alone."""
+    def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
+        """Integrals of the errors of forces, at most as large as the forces, in contact alone."""
         values = {}
-        for one in expected:
+        for one, axes in zip(found.expected, found.axes, strict=True):
             reading = self._wrenches.readings.get(one.operator.link)
             if reading is None:
                 continue
-            pose = one.operator.pose(self._state(self._drive.joints), self.holding.frames)
-            turn = quaternions.conjugate(pose.orientation)
-            force = torch.as_tensor(reading.value[..., :3]).to(passed)
-            felt = quaternions.rotate(turn, force)[..., list(one.operator.axes or ())]
+            force = torch.as_tensor(reading.value[..., :3, None]).to(passed)
+            error = one.force - (axes @ force).squeeze(-1)
             fresh = torch.as_tensor(reading.age == 0).to(passed.device)
-            known = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
+            counts = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
             left = torch.exp(-(1 - one.share) * dt / RELEASE_TIME).unsqueeze(-1)
-            value = before.get(one.operator, torch.zeros_like(felt)) * left
-            value = value + self._gains.integral * known * (one.force - felt)
+            value = self._drive.integrals.get(one.operator, torch.zeros_like(error)) * left
             most = one.force.norm(dim=-1, keepdim=True)
+            value = value + self._gains.integral * counts * error
             values[one.operator] = value.clamp(-most, most)
         return values
 
@@ -380,6 +426,10 @@ class Found:
     rate : Tensor of shape (...)
         The fastest rate of the damping [1/s].
     expected : sequence of ExpectedForce
+    axes : sequence of Tensor of shape (..., n_axes, 3)
+        Of these forces, in the base frame.
+    estimate : Estimate, optional
+        Postures to which the springs of the joints alone would pull with that torque.
     """
 
     fused: Tensor
@@ -387,6 +437,8 @@ class Found:
     held: Tensor
     rate: Tensor
     expected: Sequence[ExpectedForce] = ()
+    axes: Sequence[Tensor] = ()
+    estimate: Estimate | None = None
 
 
 def _faults(
@@ -400,6 +452,8 @@ def _faults(
         codes[where] = Status.HOLDING.code
         for index in map(tuple, where.nonzero().tolist()):
             longest = LONGEST_TICK / max(float(rate[index]), 1e-9)
-            text = reason.format(dt=1e3 * float(dt[index]), longest=1e3 * longest, rate=1 / longest)
+            text = reason.format(
+                dt=1e3 * float(dt[index]), longest=1e3 * longest, rate=1 / longest
+            )
             reasons.setdefault(index, text)
     return {"codes": codes, "reasons": reasons}

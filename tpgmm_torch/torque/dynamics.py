@@ -83,7 +83,9 @@ class MujocoDynamics:
         self._model = model = _compiled(mujoco, robot, model)
         self._data = mujoco.MjData(model)
         self._map = _JointMap(mujoco, robot, model)
-        self.effort = torch.from_numpy(_efforts(mujoco, model, self._map.joints)).to(robot.lower)
+        self.effort = torch.from_numpy(_efforts(mujoco, model, self._map.joints)).to(
+            robot.lower
+        )
 
     def __call__(self, joints: Tensor, velocities: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Dynamics.__call__`; robots of a batch one after the other."""
@@ -188,7 +190,9 @@ def _efforts(mujoco: Any, model: Any, joints: list[int]) -> Array:
         if model.actuator_forcelimited[motor]:
             most = np.abs(model.actuator_forcerange[motor]).min()
         elif model.actuator_ctrllimited[motor] and not model.actuator_biasprm[motor].any():
-            most = np.abs(model.actuator_gainprm[motor, 0] * model.actuator_ctrlrange[motor]).min()
+            most = np.abs(
+                model.actuator_gainprm[motor, 0] * model.actuator_ctrlrange[motor]
+            ).min()
         else:
             continue
         limits[joint] = min(limits[joint], gear * most)

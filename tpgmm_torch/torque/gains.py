@@ -51,7 +51,7 @@ class TorqueGains:
     joints: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = None
     link: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = None
     joint_frequency: float = 10.0
-    link_frequency: float = 18.0
+    link_frequency: float = 24.0
     damping_ratio: float = 0.8
     frame_tolerance: float = 0.005
     frame_turn_tolerance: float = 0.02
@@ -64,7 +64,9 @@ class TorqueGains:
             value = getattr(self, name)
             if isinstance(value, float | int):
                 if not (0 < value < math.inf or (value == 0 and name in may_vanish)):
-                    raise DataError(f"{name} of TorqueGains is above 0 and finite, got {value!r}")
+                    raise DataError(
+                        f"{name} of TorqueGains is above 0 and finite, got {value!r}"
+                    )
             elif value is not None:
                 _matrix(value, name)
         if self.link is not None and len(self.link) != 6:
@@ -98,7 +100,11 @@ def _matrix(values: tuple[float, ...] | tuple[tuple[float, ...], ...], name: str
     matrix = given.diag() if given.ndim == 1 else given
     symmetric = matrix.ndim == 2 and matrix.shape == matrix.mT.shape
     if not symmetric or not torch.allclose(matrix, matrix.mT):
-        raise ShapeError(f"{name} of TorqueGains is a diagonal or a symmetric matrix: {values!r}")
+        raise ShapeError(
+            f"{name} of TorqueGains is a diagonal or a symmetric matrix: {values!r}"
+        )
     if not bool(matrix.isfinite().all()) or not bool((torch.linalg.eigvalsh(matrix) > 0).all()):
-        raise DataError(f"{name} of TorqueGains is positive definite and finite, got {values!r}")
+        raise DataError(
+            f"{name} of TorqueGains is positive definite and finite, got {values!r}"
+        )
     return matrix

@@ -42,7 +42,19 @@ from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.torque.gains import TorqueGains
 
-__all__ = ["Body", "LocalGaussians", "Mechanics", "TorqueRows", "force_rows", "fused_torque"]
+__all__ = [
+    "Body",
+    "LocalGaussians",
+    "Mechanics",
+    "TorqueRows",
+    "fastest",
+    "force_axes",
+    "force_row",
+    "force_bodies",
+    "fused_torque",
+    "jacobians",
+    "joint_rows",
+]
 
 #: Directions in which links move by less than this share of what their axes suggest are given
 #: up smoothly, as postures become singular (a ratio of eigenvalues, without a unit).
@@ -53,7 +65,11 @@ PRIOR = 1e-9
 FREE = 1e12
 #: Smallest share of contact of which a force has an effect.
 LEAST_SHARE = 1e-3
+#: Inverse of the largest mass and inertia of a link that count [1/kg, 1/(kg m^2)].
+LEAST_MOBILITY = 1e-3
 
+#: A link, or an object, that moves; what it is seen from, where that moves too; whether that is
+#: an object that is held.
 Body = tuple[str, str | None, bool]
 
 
@@ -131,7 +147,9 @@ class Mechanics:
             _blocks(eye, seen_six),
             torch.cat((velocities, turned), -1),
             _blocks(joint, link),
-            _blocks(twice * geometric_mean(inertia, joint), twice * geometric_mean(link, masses)),
+            _blocks(
+                twice * geometric_mean(inertia, joint), twice * geometric_mean(link, masses)
+            ),
         )
 
     @property
@@ -158,7 +176,7 @@ def _inverse(mobility: Tensor) -> tuple[Tensor, Tensor]:
     once axes are scaled alike: ``a / SINGULAR^2`` in place of ``1 / a`` gives them up.
     """
     axes = mobility.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(axes > 0, axes, 1.0).rsqrt()
+    scale = axes.clamp_min(LEAST_MOBILITY).rsqrt()
     values, vectors = torch.linalg.eigh(scale.unsqueeze(-1) * mobility * scale.unsqueeze(-2))
     values = values.clamp_min(0)
     kept = (values / SINGULAR).square().clamp_max(1.0)
@@ -232,10 +250,13 @@ class LocalGaussians:
         self.marginals, self.stack = skill.marginals, Stack(*operators)
         self._starts = self.stack.quaternion_starts(kinematics)
         self._kinematics = kinematics
-        forces = [(one.link, None, False) for one in skill.operators if isinstance(one, Wrench)]
-        bodies = [_body(one, kinematics) for one in members if isinstance(one, PoseOperator)]
-        #: What the rows of :class:`Mechanics` are of.
-        self.bodies: tuple[Body, ...] = tuple(dict.fromkeys([*bodies, *forces]))
+        #: What the rows of :class:`Mechanics` are of: which of the six are asked for.
+        self.bodies = force_bodies(skill.operators)
+        for leaf in members:
+            if isinstance(leaf, PoseOperator):
+                body, turns = _body(leaf, kinematics), leaf.gain is not None
+                place, turn = self.bodies.get(body, (False, False))
+                self.bodies[body] = place or not turns, turn or turns
         index: list[int] = []
         self._tangents: list[tuple[int, Any]] = []
         labels, noise = [], []  # operator, leaf and three coordinates that rows belong to
@@ -262,7 +283,9 @@ class LocalGaussians:
         if isinstance(leaf, Canonical):
             return list(leaf.columns(self._kinematics.joint_names))
         assert isinstance(leaf, PoseOperator)
-        first = self._kinematics.n_joints + 6 * self.bodies.index(_body(leaf, self._kinematics))
+        first = self._kinematics.n_joints + 6 * list(self.bodies).index(
+            _body(leaf, self._kinematics)
+        )
         return [first + 3 * (leaf.gain is not None) + i for i in range(3)]
 
     def mixed(self, time: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -353,27 +376,41 @@ class LocalGaussians:
         return turns
 
 
-def jacobians(bodies: Sequence[Body], state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+def force_bodies(operators: Sequence[Operator]) -> dict[Body, tuple[bool, bool]]:
+    """Links of forces, and whether their positions and turns are asked for."""
+    forces = [one for one in operators if isinstance(one, Wrench)]
+    return {(one.link, None, False): (True, False) for one in forces}
+
+
+def jacobians(
+    bodies: Mapping[Body, tuple[bool, bool]], state: RobotState, frames: Mapping[str, Frame]
+) -> Tensor:
     """Jacobians (..., B, 6, n) of links and objects, in the base frame.
 
     Parameters
     ----------
-    bodies : sequence of Body
+    bodies : mapping of Body to tuple of two bool
+        Whether positions and turns are asked for; rows are zero where they are not.
     state : RobotState
     frames : mapping of str to Frame
     """
     found = []
-    for link, frame, held in bodies:
+    for (link, frame, held), (place, turn) in bodies.items():
         if frame is not None:
-            place = RelativePosition(link, frame, held=held)
-            turn = RelativeOrientation(link, frame, held=held)
-            jacobian = linearize_poses((place, turn), state, frames).jacobian
+            both = (
+                RelativePosition(link, frame, held=held),
+                RelativeOrientation(link, frame, held=held),
+            )
+            jacobian = linearize_poses(both, state, frames).jacobian
             assert jacobian is not None
-            found.append(jacobian)
         elif link in state.links:
-            found.append(state.jacobian(link))
+            jacobian = state.jacobian(link)
         else:  # an object that is free
-            found.append(torch.zeros_like(state.jacobians[..., 0, :, :]))
+            jacobian = torch.zeros_like(state.jacobians[..., 0, :, :])
+        if not (place and turn):
+            asked = torch.tensor([place] * 3 + [turn] * 3).to(jacobian).unsqueeze(-1)
+            jacobian = jacobian * asked
+        found.append(jacobian)
     if not found:
         return state.jacobians[..., :0, :, :]
     return torch.stack(torch.broadcast_tensors(*found), -3)
@@ -405,16 +442,28 @@ def fastest(rates: Tensor) -> Tensor:
     return torch.linalg.eigvals(rates).real.amax(-1)
 
 
-def force_rows(
-    expected: Sequence[ExpectedForce],
-    integrals: Mapping[Wrench, Tensor],
-    bodies: Sequence[Body],
-    state: RobotState,
-    frames: Mapping[str, Frame],
+def force_axes(operator: Wrench, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    """The axes ``e^T`` (..., n_axes, 3) of a force, in the base frame.
+
+    Parameters
+    ----------
+    operator : Wrench
+    state : RobotState
+    frames : mapping of str to Frame
+    """
+    rotation = quaternions.to_matrix(operator.pose(state, frames).orientation)
+    return rotation.mT[..., list(operator.axes or ()), :]
+
+
+def force_row(
+    one: ExpectedForce,
+    axes: Tensor,
+    integral: Tensor | float,
+    body: int,
     mechanics: Mechanics,
     gains: TorqueGains,
-) -> list[TorqueRows]:
-    r"""Rows of expected forces: along axes ``e``, ``e^T T tau' = f - D_f e^T v + integral``.
+) -> TorqueRows:
+    r"""Rows of an expected force along axes ``e``: ``e^T T tau' = f - D_f e^T v + integral``.
 
     Where only a share :math:`\kappa` of the demonstrations is in contact, the variance grows by
     :math:`(f_c^2 + c^2) (1 - \kappa) / \kappa`, with :math:`f_c = f / \kappa` the force in contact
@@ -422,45 +471,36 @@ def force_rows(
 
     Parameters
     ----------
-    expected : sequence of ExpectedForce
-    integrals : mapping of Wrench to Tensor of shape (..., n_axes)
-        Integrals of the errors of forces [N].
-    bodies : sequence of Body
-        Of the mechanics.
-    state : RobotState
-    frames : mapping of str to Frame
+    one : ExpectedForce
+    axes : Tensor of shape (..., n_axes, 3)
+    integral : Tensor of shape (..., n_axes)
+        Of the error of the force [N].
+    body : int
+        Which one of the mechanics the link is.
     mechanics : Mechanics
     gains : TorqueGains
     """
-    n, found = state.joints.shape[-1], []
-    for one in expected:
-        share = one.share.clamp_min(LEAST_SHARE)[..., None]
-        operator, body = one.operator, bodies.index((one.operator.link, None, False))
-        axes = quaternions.to_matrix(operator.pose(state, frames).orientation).mT
-        axes = axes[..., list(operator.axes or ()), :]
-        rows = slice(n + 6 * body, n + 6 * body + 3)
-        mobility = mechanics.mobility[..., body, :3, :3]
-        masses = 1 / (axes @ mobility @ axes.mT).diagonal(dim1=-2, dim2=-1)
-        damping = 2 * gains.damping_ratio * (gains.contact_stiffness * masses).sqrt()
-        speed = (axes @ mechanics.velocity[..., rows, None]).squeeze(-1)
-        target = one.force + integrals.get(operator, torch.zeros_like(one.force))
-        target = target - damping * speed
-        force = one.force.square().sum(-1, keepdim=True) / share.square() + operator.contact**2
-        noise = (force * (1 - share) / share).unsqueeze(-1)
-        seen = axes @ mechanics.seen[..., rows, rows] @ axes.mT
-        found.append(
-            TorqueRows(
-                axes @ mechanics.consistent[..., rows, :],
-                (seen @ target.unsqueeze(-1)).squeeze(-1),
-                one.covariance + noise * torch.eye(target.shape[-1]).to(target),
-                (damping / masses).amax(-1),
-            )
-        )
-    return found
+    first = mechanics.inertia.shape[-1] + 6 * body
+    rows, share = slice(first, first + 3), one.share.clamp_min(LEAST_SHARE)[..., None]
+    mobility = axes @ mechanics.mobility[..., body, :3, :3] @ axes.mT
+    masses = 1 / mobility.diagonal(dim1=-2, dim2=-1).clamp_min(LEAST_MOBILITY)
+    damping = 2 * gains.damping_ratio * (gains.contact_stiffness * masses).sqrt()
+    speed = (axes @ mechanics.velocity[..., rows, None]).squeeze(-1)
+    targets = (one.force + integral - damping * speed).unsqueeze(-1)
+    force = one.force.square().sum(-1, keepdim=True) / share.square()
+    noise = (force + one.operator.contact**2) * (1 - share) / share
+    return TorqueRows(
+        axes @ mechanics.consistent[..., rows, :],
+        (axes @ mechanics.seen[..., rows, rows] @ axes.mT @ targets).squeeze(-1),
+        one.covariance + noise.expand_as(one.force).diag_embed(),
+        (damping / masses).amax(-1),
+    )
 
 
-def fused_torque(rows: Sequence[TorqueRows], held: Tensor, mechanics: Mechanics) -> Tensor:
-    """The mean (..., n) of the product of all rows, and of a prior.
+def fused_torque(
+    rows: Sequence[TorqueRows], held: Tensor, mechanics: Mechanics
+) -> tuple[Tensor, Tensor]:
+    """Mean (..., n) and covariance (..., n, n) of the product of all rows, and of a prior.
 
     Parameters
     ----------
@@ -478,7 +518,7 @@ def fused_torque(rows: Sequence[TorqueRows], held: Tensor, mechanics: Mechanics)
         )
         precision, vector = precision + more, vector + towards
     factor = gaussians.cholesky(precision, "the precision of the torques")
-    return torch.cholesky_solve(vector, factor).squeeze(-1)
+    return torch.cholesky_solve(vector, factor).squeeze(-1), torch.cholesky_inverse(factor)
 
 
 def _body(leaf: PoseOperator, kinematics: Kinematics) -> Body:
