@@ -7,6 +7,7 @@ limits.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,7 +18,6 @@ from torch import Tensor
 
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
-from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
@@ -190,12 +190,8 @@ class TorqueController(Controller):
     def _limits_of(self, effort: Any, like: Tensor) -> Tensor:
         """Largest torques (n_joints,)."""
         if effort is None:
-            effort = getattr(self._dynamics, "effort", None)
-        if effort is None:
-            effort = (
-                torch.full_like(like[..., :1], torch.inf).flatten()[:1].expand(like.shape[-1])
-            )
-        limits = as_tensor(effort, "effort").to(like)
+            effort = getattr(self._dynamics, "effort", [math.inf] * like.shape[-1])
+        limits = torch.as_tensor(effort).to(like)
         if limits.shape != like.shape[-1:] or not bool((limits > 0).all()):
             raise DataError(
                 f"effort has a torque above 0 for each of {like.shape[-1]} joints, got {effort!r}"

@@ -21,7 +21,7 @@ class TorqueGains:
     ----------
     joints : sequence of float, or of rows of an (n, n) matrix, optional
         Stiffness of the joints ``K_q`` [N m/rad or N/m]. By default
-        ``joint_frequency^2 diag(H)`` at the start.
+        ``joint_frequency^2 H`` at the start.
     link : sequence of 6 float, or of rows of a (6, 6) matrix, optional
         Stiffness of a link's pose ``K_x``, ``K_o`` [N/m; N m/rad], in the base frame. By
         default ``link_frequency^2`` times the mass (and the inertia) that the link has at the
@@ -50,7 +50,7 @@ class TorqueGains:
 
     joints: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = None
     link: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = None
-    joint_frequency: float = 10.0
+    joint_frequency: float = 20.0
     link_frequency: float = 24.0
     damping_ratio: float = 0.8
     frame_tolerance: float = 0.005
@@ -75,7 +75,7 @@ class TorqueGains:
     def joint_stiffness(self, inertia: Tensor) -> Tensor:
         """``K_q`` (..., n, n) of robots of an inertia (..., n, n)."""
         if self.joints is None:
-            return self.joint_frequency**2 * inertia.diagonal(dim1=-2, dim2=-1).diag_embed()
+            return self.joint_frequency**2 * inertia
         matrix = _matrix(self.joints, "joints").to(inertia)
         if matrix.shape[-1] != inertia.shape[-1]:
             raise ShapeError(
