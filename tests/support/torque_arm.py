@@ -22,19 +22,19 @@ BOARD = Frame([0.45, 0.05, 0.35], [0.96, 0.1, -0.2, 0.17])
 
 def mjcf() -> str:
     """Axes z, y, z, y, z, y, z, with motors of limited torque."""
-    bodies, ends, motors = "", "", ""
-    for i, (length, mass) in enumerate(zip([0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.1], [4, 3, 3, 2, 2, 1, 0.5])):
-        axis, size = ("0 0 1", "0 1 0")[i % 2], 0.005 * mass
+    bodies, motors = "", ""
+    links = [(0.3, 4), (0.1, 3), (0.3, 3), (0.1, 2), (0.3, 2), (0.1, 1), (0.1, 0.5)]
+    for i, (length, mass) in enumerate(links):
+        axis, inertia = ("0 0 1", "0 1 0")[i % 2], 3 * f"{0.005 * mass} "
         bodies += (
-            f'<body name="l{i}" pos="0 0 {length}"><inertial mass="{mass}" pos="0.01 0 0.05" '
-            f'diaginertia="{size} {size} {size}"/><joint name="j{i}" axis="{axis}" armature="0.05"/>'
+            f'<body name="l{i}" pos="0 0 {length}"><joint name="j{i}" axis="{axis}" '
+            f'armature="0.05"/><inertial mass="{mass}" pos="0.01 0 0.05" diaginertia="{inertia}"/>'
         )
-        motors += f'<motor joint="j{i}" ctrlrange="{-LIMITS[i]} {LIMITS[i]}" ctrllimited="true"/>'
-        ends += "</body>"
-    tip = '<site name="tip" pos="0.02 0 0.1"/>'
-    return (
-        f'<mujoco><worldbody>{bodies}{tip}{ends}</worldbody><actuator>{motors}</actuator></mujoco>'
-    )
+        motors += (
+            f'<motor joint="j{i}" ctrlrange="{-LIMITS[i]} {LIMITS[i]}" ctrllimited="true"/>'
+        )
+    bodies += '<site name="tip" pos="0.02 0 0.1"/>' + len(links) * "</body>"
+    return f"<mujoco><worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
 
 
 @functools.cache

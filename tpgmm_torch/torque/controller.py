@@ -1,8 +1,8 @@
 """A running skill for robots with torque control: forces, poses and postures in one product.
 
-A tick is that of a :class:`~tpgmm_torch.Controller`, whose inputs, clock, held objects and status
-are the same, and one stage more, *drive*: the torque at the measured state, its fading, and its
-limits.
+A tick is that of a :class:`~tpgmm_torch.Controller`, whose inputs, clock, held objects and
+status are the same, and one stage more, *drive*: the torque at the measured state, how it
+fades in and out, and its limits.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,10 +21,11 @@ from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
-from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.motion.follower import Follower
+from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.torque.dynamics import Dynamics
 from tpgmm_torch.torque.gains import TorqueGains
@@ -41,13 +43,13 @@ from tpgmm_torch.torque.rows import (
 
 __all__ = ["TorqueCommand", "TorqueController"]
 
-#: Time in which the torque of the skill fades when a state is not known [s]: some ticks that
-#: are lost do nothing, and an arm of 1 rad/s moves by less than 3 degrees.
+#: Time in which the torque of the skill fades when a state is not known [s]: ticks that are
+#: lost do nothing, and an arm of 1 rad/s moves by less than 3 degrees.
 FADING_TIME = 0.05
 #: Fastest pace of a skill's time that is fed forward: a clock that catches up goes no faster.
 FASTEST_PACE = 2.0
-#: Longest tick, in units of the shortest time constant of the damping: sampled and held, damping
-#: is of no use at 1 and unstable at 2, and contact takes half of the margin.
+#: Longest tick, in units of the shortest time constant of the damping: sampled and held,
+#: damping is of no use at 1 and unstable at 2, and contact takes half of the margin.
 LONGEST_TICK = 0.5
 #: Time constant with which integrals of forces fade where there is no contact [s].
 RELEASE_TIME = 0.5
@@ -58,10 +60,10 @@ NO_WRENCH = (
 )
 NO_JOINTS = "joints were not read at this step"
 NO_VELOCITIES = "velocities are missing or not finite: step(dt, joints, velocities=...)"
-NO_TORQUE = "there is no finite torque here (inertia, bias or frames)"
+NO_TORQUE = "there was no finite torque (inertia, bias or frames)"
 LONG_TICK = (
-    "a tick of {dt:.3g} ms is too long for the damping, which takes {longest:.3g} ms at most: "
-    "run at {rate:.0f} Hz or more, or with lower TorqueGains"
+    "a tick is longer than the {:.2g} ms that the damping allows: run at {:.0f} Hz or more, or "
+    "with lower TorqueGains"
 )
 
 
@@ -97,6 +99,8 @@ class Drive:
     stopped : Tensor of bool of shape (...)
         Robots that are held.
     bias : Tensor of shape (..., n_joints)
+    rate : Tensor of shape (...)
+        The fastest of the damping [1/s]; infinite where there was no finite torque.
     time : Tensor of shape (...)
         In the skill [s].
     dt : Tensor of shape (...)
@@ -111,9 +115,35 @@ class Drive:
     since: Tensor
     stopped: Tensor
     bias: Tensor
+    rate: Tensor
     time: Tensor
     dt: Tensor
     integrals: Mapping[Wrench, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Torques at a state.
+
+    Parameters
+    ----------
+    fused, bias, held : Tensor of shape (..., n_joints)
+        Of the skill beside the bias, the bias, and of a robot that is held, beside the bias.
+    rate : Tensor of shape (...)
+        The fastest of the damping [1/s].
+    estimate : Estimate
+        Where forces are expected, postures to which the springs of the joints alone would
+        pull with the skill's torque.
+    forces : sequence of (ExpectedForce, Tensor of shape (..., n_axes, 3))
+        With their axes in the base frame.
+    """
+
+    fused: Tensor
+    bias: Tensor
+    held: Tensor
+    rate: Tensor
+    estimate: Estimate
+    forces: Sequence[tuple[ExpectedForce, Tensor]] = ()
 
 
 class TorqueController(Controller):
@@ -140,14 +170,14 @@ class TorqueController(Controller):
     effort : array-like of shape (n_joints,), optional
         Largest torques [N m or N]; by default those of the dynamics.
     **settings
-        As for :class:`~tpgmm_torch.Controller`; ``blend`` is also how long the skill's torque
-        fades in. References are not moved by forces: ``admittance`` is None.
+        As for :class:`~tpgmm_torch.Controller`, of which ``trust`` is needed; ``blend`` is
+        also how long the difference between the first torque and the skill's fades.
 
     Raises
     ------
     DataError, ShapeError
-        If the skill has operators without rows of torques, the dynamics do not fit the robot,
-        or as for :class:`~tpgmm_torch.Controller`.
+        If the skill has operators without rows of torques, the dynamics or limits do not fit
+        the robot, or as for :class:`~tpgmm_torch.Controller`.
     """
 
     def __init__(
@@ -162,41 +192,33 @@ class TorqueController(Controller):
         **settings: Any,
     ) -> None:
         super().__init__(skill, joints, frames, **{"admittance": None} | settings)
+        if self._inputs is None:
+            raise DataError("trust=None follows every reading: torques need trust=Trust(...)")
         self._dynamics, self._gains = dynamics, gains
         self._blend = float(settings.get("blend", 1.0))
-        start = self.reference
+        start, zero = self.reference, torch.zeros_like(self.reference)
         expected = self._skill.expected_forces(self.time)
-        self._gaussians = None
+        self._bodies, self._gaussians = force_bodies([one.operator for one in expected]), None
         if expected and isinstance(self._skill, Regression):
             self._gaussians = LocalGaussians(self._skill, gains)
-        self._bodies = force_bodies([one.operator for one in expected])
-        if self._gaussians is not None:
             self._bodies = self._gaussians.bodies
-        self._effort = self._limits_of(effort, start)
-        zero, n = torch.zeros_like(start), start.shape[-1]
+        n = start.shape[-1]
+        effort = getattr(dynamics, "effort", None) if effort is None else effort
+        self._effort = torch.as_tensor(math.inf if effort is None else effort).to(start)
+        if self._effort.shape not in ((), (n,)) or not bool((self._effort > 0).all()):
+            raise DataError(f"effort has a torque above 0 for each of {n} joints: {effort!r}")
         inertia, bias = dynamics(start, zero)
         if inertia.shape != (*start.shape, n) or bias.shape != start.shape:
             raise ShapeError(
-                f"dynamics give an inertia {(*start.shape, n)} and a bias {tuple(start.shape)}, "
-                f"got {tuple(inertia.shape)} and {tuple(bias.shape)}"
+                f"dynamics give an inertia {(*start.shape, n)} and a bias {tuple(start.shape)}"
+                f", got {tuple(inertia.shape)} and {tuple(bias.shape)}"
             )
         at = jacobians(self._bodies, self._state(start), self.holding.frames)
         first = Mechanics.at(inertia, at, zero, gains)
         self._stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(first.mobility)
-        none = zero.sum(-1)
-        self._drive = Drive(start, zero, zero, none, none == 0, bias, self.time + none, none)
+        none, time = zero.sum(-1), self.time + zero.sum(-1)
+        self._drive = Drive(start, zero, zero, none, none == 0, bias, first.rate, time, none)
         self._tick: Any = None
-
-    def _limits_of(self, effort: Any, like: Tensor) -> Tensor:
-        """Largest torques (n_joints,)."""
-        if effort is None:
-            effort = getattr(self._dynamics, "effort", [math.inf] * like.shape[-1])
-        limits = torch.as_tensor(effort).to(like)
-        if limits.shape != like.shape[-1:] or not bool((limits > 0).all()):
-            raise DataError(
-                f"effort has a torque above 0 for each of {like.shape[-1]} joints, got {effort!r}"
-            )
-        return limits
 
     def step(
         self,
@@ -229,18 +251,32 @@ class TorqueController(Controller):
         ShapeError, UnknownNameError
             As for :meth:`Controller.step`.
         """
-        self._tick = None
-        command = super().step(dt, joints, frames, holds=holds, ages=ages, wrenches=wrenches)
-        tick, like = self._tick, self.reference
-        if tick is not None and tick.first and self._integrates and not wrenches:
+        if self.command is None and self._bodies and self._gains.integral and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
-        speeds = self._reading(velocities, "velocities")
-        known = torch.full_like(like, torch.nan)
-        if tick is not None and tick.joints is not None:
-            known = tick.joints
+        speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
+        late = self._drive.rate * torch.nan_to_num(torch.as_tensor(dt).to(speeds))
+        longest = LONGEST_TICK / float(self._drive.rate.max().clamp_min(1e-9))
+        faults = {
+            NO_VELOCITIES: ~speeds.isfinite().all(-1),
+            NO_JOINTS: ~given.isfinite().all(-1),
+            NO_TORQUE: self._drive.rate.isinf(),
+            LONG_TICK.format(1e3 * longest, 1 / longest): late > LONGEST_TICK,
+        }
+        held: dict[str, Any] = {
+            reason: np.where(robots.numpy(force=True), np.inf, 0.0)
+            for reason, robots in faults.items()
+            if bool(robots.any())
+        }
+        self._tick = None
+        command = super().step(
+            dt, joints, frames, holds=holds, ages={**(ages or {}), **held}, wrenches=wrenches
+        )
+        known = torch.full_like(speeds, torch.nan)
+        if self._tick is not None and self._tick.joints is not None:
+            known = self._tick.joints
             if self._gripping is not None:
-                known = torch.where(self._gripping, self._reading(joints, "joints"), known)
-        self.command = driven = self._driven(command, tick, known, speeds)
+                known = torch.where(self._gripping, given, known)
+        self.command = driven = self._driven(command, known, speeds)
         return driven
 
     # Stages that are others where forces are expected: robots are where they are pushed to
@@ -271,44 +307,31 @@ class TorqueController(Controller):
         self._tick = tick
         return super()._send(tick)
 
-    @property
-    def _integrates(self) -> bool:
-        return self._gains.integral > 0 and bool(self._skill.expected_forces(self.time))
-
-    def _reading(self, values: Any, name: str) -> Tensor:
+    def _numbers(self, values: Any, name: str) -> Tensor:
         """Numbers (..., n_joints), which need not be finite."""
         like = self.reference
         if values is None:
             return torch.full_like(like, torch.nan)
         given = torch.as_tensor(values).to(like)
         if given.shape != like.shape:
-            raise ShapeError(
-                f"{name} have shape {tuple(like.shape)} as the joints of the start, got "
-                f"{tuple(given.shape)}"
-            )
+            raise ShapeError(f"{name} have shape {tuple(like.shape)}, got {tuple(given.shape)}")
         return given
 
     # Stage drive
 
-    def _driven(
-        self, command: Command, tick: Any, joints: Tensor, velocities: Tensor
-    ) -> TorqueCommand:
+    def _driven(self, command: Command, joints: Tensor, velocities: Tensor) -> TorqueCommand:
         """The command with torques."""
-        last, batch = self._drive, self.reference.shape[:-1]
-        dt = last.dt
-        if tick is not None:
-            dt = torch.as_tensor(tick.seconds).to(joints).expand(batch)
-        is_read, moves = (x.isfinite().all(-1) for x in (joints, velocities))
-        joints = torch.where(is_read.unsqueeze(-1), joints, last.joints)
-        velocities = torch.where(moves.unsqueeze(-1), velocities, 0.0)
-        faults = [(~moves, NO_VELOCITIES), (~is_read, NO_JOINTS)]
-        faults.append((command.of(Status.HOLDING), ""))
+        last, stopped, dt = self._drive, command.of(Status.HOLDING), self._drive.dt
+        if self._tick is not None:
+            dt = torch.as_tensor(self._tick.seconds).to(dt).expand_as(dt)
+        stopped = stopped | joints.isnan().any(-1)
+        joints = torch.where(joints.isnan(), last.joints, joints)
+        velocities = torch.nan_to_num(velocities, 0.0, 0.0, 0.0)
         found = self._torques(command, joints, velocities, dt)
-        finite = found.fused.isfinite().all(-1) & found.bias.isfinite().all(-1)
-        faults += [(~finite, NO_TORQUE), (dt * found.rate > LONGEST_TICK, LONG_TICK)]
-        stopped = torch.stack([where for where, _ in faults]).any(0)
+        finite = (found.fused + found.bias + found.held).isfinite().all(-1)
+        stopped, rate = stopped | ~finite, torch.where(finite, found.rate, torch.inf)
         bias = torch.where(finite.unsqueeze(-1), found.bias, last.bias)
-        held = torch.where(found.held.isfinite(), found.held, 0.0)
+        held = torch.where(finite.unsqueeze(-1), found.held, 0.0)
         left = (1 - dt / FADING_TIME).clamp_min(0.0).unsqueeze(-1)
         at_rest = held + left * (last.sent - held)
         # what is sent goes on where it was: the difference fades, as that of postures does
@@ -319,15 +342,13 @@ class TorqueController(Controller):
         left = 1 - (share**3 * (10 + share * (6 * share - 15))).unsqueeze(-1)
         sent = torch.where(stopped.unsqueeze(-1), at_rest, found.fused - left * offset)
         torque = (bias + sent).clamp(-self._effort, self._effort)
-        free = ~stopped & (bias + sent == torque).all(-1)
+        free = torch.where(~stopped & (bias + sent == torque).all(-1), dt, 0.0)
         self._drive = Drive(
-            joints, sent, offset, since, stopped, bias, command.time.expand(batch), dt,
-            self._integrated(found, torch.where(free, dt, 0.0), dt),
+            joints, sent, offset, since, stopped, bias, rate, command.time.expand_as(dt), dt,
+            self._integrated(found, free, dt),
         )  # fmt: skip
         values = {one.name: getattr(command, one.name) for one in fields(Command)}
-        if found.estimate is not None:
-            values["estimate"] = found.estimate
-        return TorqueCommand(**values | _faults(command, faults, dt, found.rate), torque=torque)
+        return TorqueCommand(**values | {"estimate": found.estimate}, torque=torque)
 
     def _torques(
         self, command: Command, joints: Tensor, velocities: Tensor, dt: Tensor
@@ -335,67 +356,79 @@ class TorqueController(Controller):
         """Torques at a state; not a number where there are none."""
         inertia, bias = self._dynamics(joints, velocities)
         try:
-            return self._fused(command, joints, velocities, dt, inertia, bias)
+            state = self._state(joints)
+            at = jacobians(self._bodies, state, self.holding.frames)
+            mechanics = Mechanics.at(inertia, at, velocities, self._gains, self._stiffness)
+            held = -(mechanics.joint_damping @ velocities.unsqueeze(-1)).squeeze(-1)
+            found = Found(held, bias, held, mechanics.rate, command.estimate)
+            if self._bodies:
+                return self._pressed(command, state, mechanics, dt, found)
+            return self._followed(command, joints, velocities, inertia, found)
         except TPGMMError:
             if not bool(self._drive.dt.any()):  # the first step
                 raise
         lost = torch.full_like(joints, torch.nan)
-        return Found(lost, bias, lost, torch.zeros_like(dt))
+        return Found(lost, bias, lost, self._drive.rate, command.estimate)
 
-    def _fused(
+    def _followed(
         self,
         command: Command,
         joints: Tensor,
         velocities: Tensor,
-        dt: Tensor,
         inertia: Tensor,
-        bias: Tensor,
+        found: Found,
     ) -> Found:
-        state, frames = self._state(joints), self.holding.frames
-        at = jacobians(self._bodies, state, frames)
-        mechanics = Mechanics.at(inertia, at, velocities, self._gains, self._stiffness)
-        held = -(mechanics.joint_damping @ velocities.unsqueeze(-1)).squeeze(-1)
-        expected = self._skill.expected_forces(command.time)
-        estimate, rate = command.estimate, mechanics.rate
-        error, moving = command.reference - joints, command.velocity - velocities
-        if not self._bodies:
-            stiffness = command.stiffness_matrix
-            assert self._impedance is not None
-            damping = self._impedance.joints.damping(stiffness, inertia)
-            fused = stiffness @ error.unsqueeze(-1) + damping @ moving.unsqueeze(-1)
-            return Found(
-                fused.squeeze(-1),
-                bias,
-                held,
-                torch.maximum(rate, fastest(mechanics.inverse @ damping)),
-            )
+        """Stiffness and damping of the covariance, where no force is expected."""
+        assert self._impedance is not None
+        stiffness = command.stiffness_matrix
+        damping = self._impedance.joints.damping(stiffness, inertia)
+        pull = stiffness @ (command.reference - joints).unsqueeze(-1)
+        fused = pull + damping @ (command.velocity - velocities).unsqueeze(-1)
+        rate = torch.maximum(found.rate, fastest(torch.linalg.solve(inertia, damping)))
+        return replace(found, fused=fused.squeeze(-1), rate=rate)
+
+    def _pressed(
+        self,
+        command: Command,
+        state: RobotState,
+        mechanics: Mechanics,
+        dt: Tensor,
+        found: Found,
+    ) -> Found:
+        """The product of all rows."""
+        time, frames, joints = command.time, self.holding.frames, state.joints
+        estimate, integrals = command.estimate, self._drive.integrals
         if self._gaussians is not None:
-            passed = torch.where(dt > 0, (command.time - self._drive.time) / dt, 0.0)
+            passed = torch.where(dt > 0, (time - self._drive.time) / dt, 0.0)
             pace = passed.clamp(0.0, FASTEST_PACE)
-            rows = self._gaussians.rows(command.time, pace, state, frames, mechanics)
+            rows = [self._gaussians.rows(time, pace, state, frames, mechanics)]
         else:
-            rows = joint_rows(estimate.joints - joints, moving, estimate.covariance, mechanics)
-        axes = [force_axes(one.operator, state, frames) for one in expected]
-        forces = [
-            force_row(
-                one, along, self._drive.integrals.get(one.operator, 0.0),
-                list(self._bodies).index((one.operator.link, None, False)), mechanics, self._gains,
+            moving = command.velocity - mechanics.velocity[..., : joints.shape[-1]]
+            away = estimate.joints - joints
+            rows = [joint_rows(away, moving, estimate.covariance, mechanics)]
+        rates, errors = [found.rate], []
+        for one in self._skill.expected_forces(time):
+            axes, body = (
+                force_axes(one.operator, state, frames),
+                list(self._bodies).index((one.operator.link, None, False)),
             )
-            for one, along in zip(expected, axes, strict=True)
-        ]  # fmt: skip
-        rate = torch.stack([rate, *(one.rate for one in forces)]).amax(0)
-        fused, covariance = fused_torque([rows, *forces], held, mechanics)
+            integral = integrals.get(one.operator, torch.zeros_like(one.force))
+            rows.append(force_row(one, axes, integral, body, mechanics, self._gains))
+            rates.append(rows[-1].rate)
+            errors.append((one, axes))
+        fused, covariance = fused_torque(rows, found.held, mechanics)
         if self._gaussians is not None:
             compliance = torch.linalg.inv(self._stiffness[0])
-            joints = joints + (compliance @ fused.unsqueeze(-1)).squeeze(-1)
+            away = (compliance @ fused.unsqueeze(-1)).squeeze(-1)
             spread = compliance @ covariance @ compliance
-            estimate = Estimate(joints, spread, self._skill.weights_at(command.time))
-        return Found(fused, bias, held, rate, expected, axes, estimate)
+            estimate = Estimate(joints + away, spread, estimate.activation)
+        rate = torch.stack(rates).amax(0)
+        return replace(found, fused=fused, rate=rate, estimate=estimate, forces=errors)
 
     def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
-        """Integrals of the errors of forces, at most as large as the forces, in contact alone."""
+        """Integrals of the errors of forces in contact, at most as large as the forces."""
         values = {}
-        for one, axes in zip(found.expected, found.axes, strict=True):
+        for one, axes in found.forces:
             reading = self._wrenches.readings.get(one.operator.link)
             if reading is None:
                 continue
@@ -409,47 +442,3 @@ class TorqueController(Controller):
             value = value + self._gains.integral * counts * error
             values[one.operator] = value.clamp(-most, most)
         return values
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Torques at a state.
-
-    Parameters
-    ----------
-    fused, bias, held : Tensor of shape (..., n_joints)
-        Of the skill beside the bias, the bias, and of a robot that is held, beside the bias.
-    rate : Tensor of shape (...)
-        The fastest rate of the damping [1/s].
-    expected : sequence of ExpectedForce
-    axes : sequence of Tensor of shape (..., n_axes, 3)
-        Of these forces, in the base frame.
-    estimate : Estimate, optional
-        Postures to which the springs of the joints alone would pull with that torque.
-    """
-
-    fused: Tensor
-    bias: Tensor
-    held: Tensor
-    rate: Tensor
-    expected: Sequence[ExpectedForce] = ()
-    axes: Sequence[Tensor] = ()
-    estimate: Estimate | None = None
-
-
-def _faults(
-    command: Command, faults: Sequence[tuple[Tensor, str]], dt: Tensor, rate: Tensor
-) -> dict[str, Any]:
-    """Codes and reasons of a command, with those of robots that are held by their torques."""
-    codes, reasons = command.codes.clone(), dict(command.reasons)
-    for where, reason in faults:
-        if not reason or not bool(where.any()):
-            continue
-        codes[where] = Status.HOLDING.code
-        for index in map(tuple, where.nonzero().tolist()):
-            longest = LONGEST_TICK / max(float(rate[index]), 1e-9)
-            text = reason.format(
-                dt=1e3 * float(dt[index]), longest=1e3 * longest, rate=1 / longest
-            )
-            reasons.setdefault(index, text)
-    return {"codes": codes, "reasons": reasons}

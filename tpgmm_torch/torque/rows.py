@@ -1,7 +1,7 @@
 r"""Rows of torque space: Gaussians of torques, fused as Gaussians of joints are.
 
-With :math:`\tau = h(q, \dot q) + \tau'` each operator says ``T tau' = y`` with a covariance. All
-rows of one link belong to one dynamically consistent inverse of its six-row Jacobian,
+With :math:`\tau = h(q, \dot q) + \tau'` each operator says ``T tau' = y`` with a covariance.
+All rows of one link belong to one dynamically consistent inverse of its six-row Jacobian,
 :math:`T = \Lambda J H^{-1}`, :math:`\Lambda = (J H^{-1} J^T)^{-1}`, so that a force asks for no
 moment; rows of joints have ``T = I``. With the row ``J (q* - q) = M mu + c`` of the paper's
 Table I,
@@ -49,8 +49,8 @@ __all__ = [
     "TorqueRows",
     "fastest",
     "force_axes",
-    "force_row",
     "force_bodies",
+    "force_row",
     "fused_torque",
     "jacobians",
     "joint_rows",
@@ -59,9 +59,9 @@ __all__ = [
 #: Directions in which links move by less than this share of what their axes suggest are given
 #: up smoothly, as postures become singular (a ratio of eigenvalues, without a unit).
 SINGULAR = 1e-3
-#: Precision of the prior ``PRIOR H^-1`` around the torque that holds a robot [s^-4 in its metric].
+#: Precision of the prior ``PRIOR H^-1`` around the torque that holds a robot [1/J].
 PRIOR = 1e-9
-#: Variance that stands for none at all, of rows between things that no joint moves [m^2, rad^2].
+#: Variance that stands for none, of rows between things that no joint moves [m^2, rad^2].
 FREE = 1e12
 #: Smallest share of contact of which a force has an effect.
 LEAST_SHARE = 1e-3
@@ -361,7 +361,7 @@ class LocalGaussians:
     def _turns(
         self, displacement: Tensor, state: RobotState, frames: Mapping[str, Frame]
     ) -> Tensor:
-        """From tangent spaces to the base frame, (..., m, m), by the transpose of ``J``'s factor.
+        """From tangent spaces to the base frame (..., m, m), by the transpose of ``J``'s factor.
 
         ``J = J_r(y)^-1 R(eps)^T J_o``: the torque of the potential ``k |mu - y|^2 / 2`` is
         ``J_o^T R(eps) J_r(y)^-T k (mu - y)``, however large the turn.
@@ -465,9 +465,10 @@ def force_row(
 ) -> TorqueRows:
     r"""Rows of an expected force along axes ``e``: ``e^T T tau' = f - D_f e^T v + integral``.
 
-    Where only a share :math:`\kappa` of the demonstrations is in contact, the variance grows by
-    :math:`(f_c^2 + c^2) (1 - \kappa) / \kappa`, with :math:`f_c = f / \kappa` the force in contact
-    and ``c`` that at which contact begins: at even odds a force is as uncertain as it is large.
+    Where only a share :math:`\kappa` of the demonstrations is in contact, the variance grows
+    by :math:`(f_c^2 + c^2) (1 - \kappa) / \kappa`, with :math:`f_c = f / \kappa` the force in
+    contact and ``c`` that at which contact begins: at even odds a force is as uncertain as it
+    is large.
 
     Parameters
     ----------

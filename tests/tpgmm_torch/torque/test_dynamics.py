@@ -42,14 +42,13 @@ def test_a_urdf_has_its_masses_and_what_mimics_moves_along():
     joints, still = torch.tensor([0.3]).double(), torch.zeros(1).double()
 
     def energies(q, qd):
+        """Potential energy, and kinetic energy, from the masses of the URDF."""
         state = fork.state(q)
-        centers = [Robot.from_urdf(URDF, links=["a"], tools={"c": ("a", [0.1, 0, 0.2], [1, 0, 0, 0])}),]
-        del centers
-        a = torch.stack([0.1 * torch.cos(q) + 0.2 * torch.sin(q), -0.1 * torch.sin(q) + 0.2 * torch.cos(q)])
-        height = 9.81 * (2 * a[1, 0] + state.position("b")[2])
+        center = 0.2 * torch.cos(q[0]) - 0.1 * torch.sin(q[0])
         way = state.jacobian("b") @ qd
-        motion = 0.5 * (0.1 + 2 * 0.05) * qd**2 + 0.5 * way[:3] @ way[:3] + 0.01 * way[3:] @ way[3:]
-        return height, motion.sum()
+        motion = 0.5 * (0.1 + 2 * 0.05) * qd @ qd + 0.5 * way[:3] @ way[:3]
+        potential = 9.81 * (2 * center + state.position("b")[2])
+        return potential, motion + 0.01 * way[3:] @ way[3:]
 
     inertia, bias = found(joints, still)
     step = 1e-6

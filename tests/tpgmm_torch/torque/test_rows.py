@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
 from tests.support.torque_arm import (
     BOARD,
     POSE,
@@ -15,7 +16,6 @@ from tests.support.torque_arm import (
     robot,
     skill,
 )
-
 from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
@@ -38,7 +38,10 @@ from tpgmm_torch.torque.rows import (
 
 FRAMES = {"board": BOARD}
 REST = torch.zeros(7, dtype=torch.float64)
-STIFF = {"joints": (90.0, 80.0, 70.0, 60.0, 20.0, 15.0, 10.0), "link": (900.0,) * 3 + (30.0,) * 3}
+STIFF = {
+    "joints": (90.0, 80.0, 70.0, 60.0, 20.0, 15.0, 10.0),
+    "link": (900.0,) * 3 + (30.0,) * 3,
+}
 
 
 def mechanics_at(q, bodies, gains, qd=REST):
@@ -66,8 +69,10 @@ def test_the_inverse_is_the_dynamically_consistent_one_of_mujoco():
     arm = Simulation(POSTURE)
     columns = [arm.acceleration(one) - arm.acceleration(-one) for one in np.eye(7)]
     accelerations = jacobian @ np.array(columns).T / 2
-    inertia = np.linalg.inv(jacobian @ np.linalg.solve(dynamics()(
-        torch.tensor(POSTURE), REST)[0].numpy(), jacobian.T))
+    inertia = np.linalg.inv(
+        jacobian
+        @ np.linalg.solve(dynamics()(torch.tensor(POSTURE), REST)[0].numpy(), jacobian.T)
+    )
     np.testing.assert_allclose(mechanics.consistent[7:], inertia @ accelerations, atol=1e-9)
     # a static force is a force, and no moment
     static = mechanics.consistent[7:].numpy() @ jacobian.T @ [0, 0, 8.0, 0, 0, 0]
@@ -103,7 +108,9 @@ def test_torques_are_the_gradient_of_a_potential(operator, distance):
     np.testing.assert_allclose(found, -np.array(gradient), atol=2e-6)
 
 
-@pytest.mark.parametrize("operators", [[POSE], [Canonical(), POSE], [Stack(Canonical(), *POSE.operators)]])
+@pytest.mark.parametrize(
+    "operators", [[POSE], [Canonical(), POSE], [Stack(Canonical(), *POSE.operators)]]
+)
 def test_with_stiffness_like_inertia_it_is_the_fusion_of_joints(operators):
     model, square = skill(operators, POSTURE), 100.0
     q = POSTURE + 0.1 * np.random.default_rng(1).normal(size=7)
@@ -137,7 +144,7 @@ def test_a_force_is_pressed_where_a_position_is_not_known():
 
 def test_what_the_pose_leaves_free_is_the_posture_s():
     gains = TorqueGains(**STIFF, frame_tolerance=0, frame_turn_tolerance=0)
-    far = POSTURE + [0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0]
+    far = POSTURE + 0.3 * np.eye(7)[2]
     inertia, _ = dynamics()(torch.tensor(far), REST)
     softness = torch.diag(1 / torch.tensor(STIFF["joints"]).double())
     posture = skill([Canonical()], POSTURE).conditionals[0]
@@ -167,7 +174,9 @@ def test_singular_postures_have_finite_torques_that_change_little(bend):
 def test_a_share_of_contact_weakens_the_force():
     operators, pressed = [*WIPING, Wrench("tip", "board", axes=(2,))], []
     for share in (1.0, 0.5, 0.01):
-        found, mechanics = torque(skill(operators, POSTURE, share=share), POSTURE, TorqueGains())
+        found, mechanics = torque(
+            skill(operators, POSTURE, share=share), POSTURE, TorqueGains()
+        )
         normal = force_axes(operators[-1], robot().state(POSTURE), FRAMES)[0].numpy()
         pressed.append(normal @ mechanics.consistent[7:10].numpy() @ found)
     assert pressed[0] > 7 > pressed[1] > 0.1 > pressed[2] > 0
