@@ -217,6 +217,9 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
         One of :data:`~lerobot_env_bimanual.suite.names.SUITE`.
     robot : str, default="upper_body"
         One of :data:`~lerobot_env_bimanual.suite.names.ROBOTS`.
+    force : bool, default=False
+        Whether wrenches of both hands are observed, ``observation.wrench.l_hand`` and
+        ``observation.wrench.r_hand``.
     features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot; the features follow from task and robot.
     fps, episode_length, pushes, noise, condition, cameras, camera_width, camera_height, \
@@ -231,6 +234,7 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
 
     task: str | None = "handover"
     robot: str = UPPER_BODY
+    force: bool = False
 
     def __post_init__(self) -> None:
         if self.robot not in ROBOTS:

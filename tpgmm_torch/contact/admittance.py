@@ -7,7 +7,7 @@ share of contact k, and the measured force f (0 without contact), the offset d o
 
 admittance control with damping B alone (Seraji, "Adaptive Admittance Control", ICRA 1994),
 which lets go where no contact is expected. The link is taken to be ``-d e`` from where it is:
-all operators of this link then agree on moving it by ``d e``, and those of others do not change.
+operators of this link then agree on moving it by ``d e``, and others do not change.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,11 +37,11 @@ class Admittance:
 
     Parameters
     ----------
-    damping : float, default=500.0
+    damping : float, default=400.0
         B: force per speed [N s/m]. The loop is stable while the stiffness of surface, tool and
         drives in series, times the delay of the loop, is well below it: at 7 N/mm and 20 ms
         that is 140 N s/m.
-    speed : float, default=0.05
+    speed : float, default=0.1
         v: the most by which an offset changes [m/s].
     depth : float, default=0.02
         The largest offset [m]: how wrong the place of a surface may be.
@@ -53,8 +54,8 @@ class Admittance:
         If one of them is not above 0.
     """
 
-    damping: float = 500.0
-    speed: float = 0.05
+    damping: float = 400.0
+    speed: float = 0.1
     depth: float = 0.02
     release: float = 0.5
 
@@ -110,12 +111,12 @@ class Offsets:
             turn = quaternions.conjugate(operator.pose(state, frames).orientation)
             force = torch.from_numpy(reading.value[..., :3]).to(dt)
             felt = quaternions.rotate(turn, force)[..., axes]
-            touches = torch.from_numpy(reading.contact).to(dt.device).unsqueeze(-1)
+            touches = torch.from_numpy(reading.touches).to(dt.device).unsqueeze(-1)
             felt = torch.where(touches, felt, 0.0)
             wanted, share = torch.zeros_like(felt), torch.zeros_like(felt[..., :1])
             if operator in asked:
                 wanted, share = asked[operator].force, asked[operator].share.unsqueeze(-1)
-            fresh = torch.from_numpy(reading.age == 0).to(dt.device)
+            fresh = torch.from_numpy(np.asarray(reading.age == 0)).to(dt.device)
             passed = torch.where(fresh, dt, 0.0).unsqueeze(-1)
             before = self.values.get(operator, torch.zeros_like(felt))
             values[operator] = self._moved(before, wanted - felt, share, passed)

@@ -6,7 +6,8 @@
 is where a carried bottle is on a tray, ``canonical`` the joints themselves, and
 ``canonical:left_*,waist`` some of them. ``~`` and a number behind a term is its tolerance,
 ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad]. Orientations in tangent space
-are ``orientation[tangent]:l_hand@bottle`` and ``pose[tangent]:l_hand@bottle``.
+are ``orientation[tangent]:l_hand@bottle`` and ``pose[tangent]:l_hand@bottle``. Forces are
+``wrench:r_hand@board``, with the axes that count ``wrench[z]:r_hand@board``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import POSE_OPERATORS, Stack
+from tpgmm_torch.operators.wrench import Wrench
 
 __all__ = ["default_operators", "format_operator", "parse_operator"]
 
@@ -30,13 +32,18 @@ TERM = re.compile(
     r":(?P<link>[^\s:@+~]+)(@(?P<held>held:)?(?P<frame>[^\s:@+~]+))?)"
     r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
 )
+FORCE = re.compile(
+    r"wrench(\[(?P<axes>x?y?z?)\])?:(?P<link>[^\s:@+~]+)@(?P<frame>[^\s:@+~]+)"
+    r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
+)
 GRAMMAR = (
     "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
     "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
     "behind it if seen from a frame or another link, '@held:FRAME' if from an object as the "
     "robot carries it (LINK may be an object too), and '[tangent]' before the colon if "
     "orientations are rotation vectors, all but 'pose' perhaps with a tolerance, '~NUMBER', "
-    "behind it; '+' stacks them, as in 'position:l_hand@bottle + orientation:l_hand@bottle'"
+    "behind it; '+' stacks them, as in 'position:l_hand@bottle + orientation:l_hand@bottle'. "
+    "'wrench:LINK@FRAME' stands alone, or 'wrench[z]:LINK@FRAME' with the axes that count"
 )
 
 
@@ -65,6 +72,10 @@ def parse_operator(text: str) -> Operator:
 
 
 def _term(term: str, text: str) -> list[Operator]:
+    if force := FORCE.fullmatch(term):
+        axes = None if force["axes"] is None else tuple(map("xyz".index, force["axes"]))
+        given = {} if force["tolerance"] is None else {"tolerance": float(force["tolerance"])}
+        return [Wrench(force["link"], force["frame"], axes, **given)]
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
@@ -124,6 +135,9 @@ def format_operator(operator: Operator) -> str:
         text = f"{kind}{tangent}:{one.link}"
         if hasattr(operator, "frame"):
             text += f"@{'held:' if one.held else ''}{one.frame}"
+    elif type(operator) is Wrench and one.contact == Wrench.contact:
+        axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
+        text = f"wrench{axes}:{one.link}@{one.frame}"
     else:
         return repr(operator)
     return text if one.tolerance == type(one).tolerance else f"{text}~{one.tolerance!r}"

@@ -63,6 +63,11 @@ class WrenchReading:
         zero: Array = np.zeros(tuple(batch))
         return cls(threshold, np.zeros((*batch, 6)), zero > 0, zero, zero + np.inf)
 
+    @property
+    def touches(self) -> Mask:
+        """Contact, and what may become one: for those who must not wait."""
+        return np.asarray(self.contact | (self.changing > 0))
+
     def update(self, measured: Array | None, dt: float | Array) -> Self:
         """The reading after a tick.
 
@@ -74,12 +79,11 @@ class WrenchReading:
             Since the last tick [s].
         """
         if measured is None:
-            return replace(self, age=self.age + dt)
-        finite = np.isfinite(measured).all(-1)
-        share: Array = 1 - np.exp(-dt / SMOOTHING_TIME) + np.zeros_like(self.age)
-        share = np.atleast_1d(np.where(np.isinf(self.age), 1.0, share)[..., None])
-        step = np.where(finite[..., None], measured - self.value, 0.0)
-        value = self.value + share * step
+            return replace(self, age=np.asarray(self.age + dt))
+        finite = np.asarray(np.isfinite(measured).all(-1))
+        share = np.where(np.isinf(self.age), 1.0, 1 - np.exp(-dt / SMOOTHING_TIME))
+        step = np.where(np.expand_dims(finite, -1), measured - self.value, 0.0)
+        value = self.value + np.expand_dims(share, -1) * step
         size = np.linalg.norm(value[..., :3], axis=-1)
         other = np.where(self.contact, size < RELEASE * self.threshold, size >= self.threshold)
         changing = np.where(finite, np.where(other, self.changing + dt, 0.0), self.changing)
@@ -87,9 +91,9 @@ class WrenchReading:
         return replace(
             self,
             value=value,
-            contact=self.contact ^ turns,
+            contact=np.asarray(self.contact ^ turns),
             changing=np.where(turns, 0.0, changing),
-            age=np.where(finite, 0.0, self.age + dt),
+            age=np.asarray(np.where(finite, 0.0, self.age + dt)),
         )
 
 

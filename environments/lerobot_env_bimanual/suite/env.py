@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import copy
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Observation
 from lerobot_env_bimanual.bottle.measures import Closing, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import (
@@ -26,6 +29,7 @@ from lerobot_env_bimanual.start import Start
 from lerobot_env_bimanual.suite.names import UPPER_BODY
 from lerobot_env_bimanual.suite.scene import SuiteScene
 from lerobot_env_bimanual.suite.tasks import suite_task
+from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
@@ -34,6 +38,11 @@ __all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
 GRIP_FORCE = 100.0
 #: A palm that is so near to what it shall hold, and comes no nearer, takes hold of it [m].
 REACH = 0.015
+#: Observed wrenches and their hands, what sensors measure at most, and the standard deviations
+#: of their noise at ``noise=1`` [N, N m].
+WRENCHES = {f"wrench.{hand}": hand for hand in HANDS}
+FORCES = np.array([300.0] * 3 + [30.0] * 3)
+NOISE_WRENCH = np.array([0.15] * 3 + [0.0075] * 3)
 
 
 def _skips(part: Disturbance) -> bool:
@@ -65,6 +74,10 @@ class SuiteEnv(ControlledEnv):
     robot : str, default="upper_body"
         The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
         waist and arms of a Unitree G1, 17 joints.
+    force : bool, default=False
+        Whether what hands exert by contact is observed, as ``wrench.l_hand`` and
+        ``wrench.r_hand``: forces [N] and moments [N m] at their origins, in the base frame;
+        with an error of 0.15 N and 7.5 mN m in multiples of ``noise``.
     **options
         Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``mode`` and
         ``track``; an episode takes as long as the slowest demonstration and a second by
@@ -80,7 +93,10 @@ class SuiteEnv(ControlledEnv):
 
     _scene: SuiteScene
 
-    def __init__(self, task: str, robot: str = UPPER_BODY, **options: Any) -> None:
+    def __init__(
+        self, task: str, robot: str = UPPER_BODY, *, force: bool = False, **options: Any
+    ) -> None:
+        self.force = force
         self._task = suite_task(task, robot)
         self.carriers = self._task.carriers  # type: ignore[misc]
         condition = options.get("condition", NOMINAL)
@@ -103,7 +119,17 @@ class SuiteEnv(ControlledEnv):
             track=True,
             **options,
         )
+        if force:
+            every = dict.fromkeys(WRENCHES, spaces.Box(-FORCES, FORCES, dtype=np.float64))
+            self.observation_space = spaces.Dict({**self.observation_space.spaces, **every})
         self.robot, self.task, self.task_description = robot, task, self._task.description
+
+    def _observation(self) -> Observation:
+        seen = super()._observation()
+        for key, hand in WRENCHES.items() if self.force else ():
+            error = self.noise * NOISE_WRENCH * self._felt.standard_normal(6)
+            seen[key] = np.clip(self._scene.wrench(hand) + error, -FORCES, FORCES)
+        return seen
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far; the task says what each figure is."""
@@ -122,6 +148,8 @@ class SuiteEnv(ControlledEnv):
         first = start.poses[task.objects[0]]
         self._scene.reset(start.poses, start.joints, float(first[2]) - task.foot)
         self._judge, self._noted = task.judge(), 0.0
+        # whether forces are observed changes no other random number
+        self._felt = np.random.default_rng(zlib.crc32(start.joints.tobytes()) + 1)
         self._watch_hands()
         return start
 
