@@ -28,7 +28,8 @@ def mjcf() -> str:
         axis, inertia = ("0 0 1", "0 1 0")[i % 2], 3 * f"{0.005 * mass} "
         bodies += (
             f'<body name="l{i}" pos="0 0 {length}"><joint name="j{i}" axis="{axis}" '
-            f'armature="0.05"/><inertial mass="{mass}" pos="0.01 0 0.05" diaginertia="{inertia}"/>'
+            f'armature="0.05"/><inertial mass="{mass}" pos="0.01 0 0.05" '
+            f'diaginertia="{inertia}"/>'
         )
         motors += (
             f'<motor joint="j{i}" ctrlrange="{-LIMITS[i]} {LIMITS[i]}" ctrllimited="true"/>'

@@ -73,10 +73,13 @@ class TorqueCommand(Command):
 
     Parameters
     ----------
+    reference, velocity, time, estimate, codes, reasons, impedance, compute_novelty
+        As for :class:`~tpgmm_torch.control.command.Command`. Where forces are expected, the
+        reference is where the robot is.
+    relocalized, offset
+        Likewise.
     torque : Tensor of shape (..., n_joints)
         Of each joint, gravity and the bias of the motion included [N m or N].
-    **command
-        As for :class:`~tpgmm_torch.control.command.Command`.
     """
 
     torque: Tensor = field(kw_only=True)
@@ -237,9 +240,12 @@ class TorqueController(Controller):
         ----------
         dt : float or Tensor of shape (...)
             Seconds since the last step.
-        joints, velocities : array-like of shape (..., n_joints)
-            Measured [rad or m], [rad/s or m/s]. Robots without them are held.
-        frames, holds, ages, wrenches
+        joints : array-like of shape (..., n_joints)
+            Measured [rad or m]. Robots without them are held.
+        frames : mapping of str to Frame, optional
+        velocities : array-like of shape (..., n_joints)
+            Measured [rad/s or m/s]. Robots without them are held.
+        holds, ages, wrenches
             As for :meth:`Controller.step`.
 
         Returns

@@ -361,7 +361,7 @@ class LocalGaussians:
     def _turns(
         self, displacement: Tensor, state: RobotState, frames: Mapping[str, Frame]
     ) -> Tensor:
-        """From tangent spaces to the base frame (..., m, m), by the transpose of ``J``'s factor.
+        """From tangent spaces to the base frame (..., m, m), by the transposed factor of ``J``.
 
         ``J = J_r(y)^-1 R(eps)^T J_o``: the torque of the potential ``k |mu - y|^2 / 2`` is
         ``J_o^T R(eps) J_r(y)^-T k (mu - y)``, however large the turn.
@@ -377,7 +377,12 @@ class LocalGaussians:
 
 
 def force_bodies(operators: Sequence[Operator]) -> dict[Body, tuple[bool, bool]]:
-    """Links of forces, and whether their positions and turns are asked for."""
+    """Links of forces, and whether their positions and turns are asked for.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+    """
     forces = [one for one in operators if isinstance(one, Wrench)]
     return {(one.link, None, False): (True, False) for one in forces}
 
@@ -436,7 +441,13 @@ def joint_rows(
 
 
 def fastest(rates: Tensor) -> Tensor:
-    """Largest eigenvalue (...) of matrices ``H^-1 D`` (..., m, m) [1/s]."""
+    """Largest eigenvalue (...) [1/s].
+
+    Parameters
+    ----------
+    rates : Tensor of shape (..., m, m)
+        ``H^-1 D``.
+    """
     if rates.shape[-3:-2] == (0,):
         return rates.new_zeros(rates.shape[:-2])
     return torch.linalg.eigvals(rates).real.amax(-1)
