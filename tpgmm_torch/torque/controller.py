@@ -34,11 +34,9 @@ from tpgmm_torch.torque.rows import (
     Mechanics,
     fastest,
     force_axes,
-    force_bodies,
     force_row,
     fused_torque,
     jacobians,
-    joint_rows,
 )
 
 __all__ = ["TorqueCommand", "TorqueController"]
@@ -103,7 +101,9 @@ class Drive:
         Robots that are held.
     bias : Tensor of shape (..., n_joints)
     rate : Tensor of shape (...)
-        The fastest of the damping [1/s]; infinite where there was no finite torque.
+        The fastest of the damping [1/s].
+    lost : Tensor of bool of shape (...)
+        Robots without a finite torque.
     time : Tensor of shape (...)
         In the skill [s].
     dt : Tensor of shape (...)
@@ -119,6 +119,7 @@ class Drive:
     stopped: Tensor
     bias: Tensor
     rate: Tensor
+    lost: Tensor
     time: Tensor
     dt: Tensor
     integrals: Mapping[Wrench, Tensor] = field(default_factory=dict)
@@ -161,6 +162,9 @@ class TorqueController(Controller):
     state, or with a tick that is too long for the damping, they fade to gravity and damping,
     with a reason in the command. They are within the limits of effort, and finite.
 
+    Where forces are expected, robots are where they are pushed to: no clock waits for one that
+    is held back, which pulls with its stiffness to where it should be by then.
+
     Parameters
     ----------
     skill : Skill
@@ -200,9 +204,13 @@ class TorqueController(Controller):
         self._dynamics, self._gains = dynamics, gains
         self._blend = float(settings.get("blend", 1.0))
         start, zero = self.reference, torch.zeros_like(self.reference)
-        expected = self._skill.expected_forces(self.time)
-        self._bodies, self._gaussians = force_bodies([one.operator for one in expected]), None
-        if expected and isinstance(self._skill, Regression):
+        self._gaussians, self._bodies = None, {}
+        if self._skill.expected_forces(self.time):
+            if not isinstance(self._skill, Regression):
+                raise DataError(
+                    f"torques of a {type(skill).__name__} that expects forces: there are those "
+                    "of one fitted skill, model.skill; run its skills one after the other"
+                )
             self._gaussians = LocalGaussians(self._skill, gains)
             self._bodies = self._gaussians.bodies
         n = start.shape[-1]
@@ -220,7 +228,9 @@ class TorqueController(Controller):
         first = Mechanics.at(inertia, at, zero, gains)
         self._stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(first.mobility)
         none, time = zero.sum(-1), self.time + zero.sum(-1)
-        self._drive = Drive(start, zero, zero, none, none == 0, bias, first.rate, time, none)
+        self._drive = Drive(
+            start, zero, zero, none, none == 0, bias, first.rate, none > 0, time, none
+        )
         self._tick: Any = None
 
     def step(
@@ -260,12 +270,13 @@ class TorqueController(Controller):
         if self.command is None and self._bodies and self._gains.integral and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
         speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
-        late = self._drive.rate * torch.nan_to_num(torch.as_tensor(dt).to(speeds))
+        seconds = dt if isinstance(dt, float | int | Tensor) else 0.0
+        late = self._drive.rate * torch.nan_to_num(torch.as_tensor(seconds).to(speeds))
         longest = LONGEST_TICK / float(self._drive.rate.max().clamp_min(1e-9))
         faults = {
             NO_VELOCITIES: ~speeds.isfinite().all(-1),
             NO_JOINTS: ~given.isfinite().all(-1),
-            NO_TORQUE: self._drive.rate.isinf(),
+            NO_TORQUE: self._drive.lost,
             LONG_TICK.format(1e3 * longest, 1 / longest): late > LONGEST_TICK,
         }
         held: dict[str, Any] = {
@@ -335,7 +346,7 @@ class TorqueController(Controller):
         velocities = torch.nan_to_num(velocities, 0.0, 0.0, 0.0)
         found = self._torques(command, joints, velocities, dt)
         finite = (found.fused + found.bias + found.held).isfinite().all(-1)
-        stopped, rate = stopped | ~finite, torch.where(finite, found.rate, torch.inf)
+        stopped, rate = stopped | ~finite, torch.where(finite, found.rate, last.rate)
         bias = torch.where(finite.unsqueeze(-1), found.bias, last.bias)
         held = torch.where(finite.unsqueeze(-1), found.held, 0.0)
         left = (1 - dt / FADING_TIME).clamp_min(0.0).unsqueeze(-1)
@@ -350,8 +361,8 @@ class TorqueController(Controller):
         torque = (bias + sent).clamp(-self._effort, self._effort)
         free = torch.where(~stopped & (bias + sent == torque).all(-1), dt, 0.0)
         self._drive = Drive(
-            joints, sent, offset, since, stopped, bias, rate, command.time.expand_as(dt), dt,
-            self._integrated(found, free, dt),
+            joints, sent, offset, since, stopped, bias, rate, ~finite,
+            command.time.expand_as(dt), dt, self._integrated(found, free, dt),
         )  # fmt: skip
         values = {one.name: getattr(command, one.name) for one in fields(Command)}
         return TorqueCommand(**values | {"estimate": found.estimate}, torque=torque)
@@ -365,33 +376,22 @@ class TorqueController(Controller):
             state = self._state(joints)
             at = jacobians(self._bodies, state, self.holding.frames)
             mechanics = Mechanics.at(inertia, at, velocities, self._gains, self._stiffness)
-            held = -(mechanics.joint_damping @ velocities.unsqueeze(-1)).squeeze(-1)
-            found = Found(held, bias, held, mechanics.rate, command.estimate)
+            held, rate = mechanics.held, mechanics.rate
+            found = Found(held, bias, held, rate, command.estimate)
             if self._bodies:
                 return self._pressed(command, state, mechanics, dt, found)
-            return self._followed(command, joints, velocities, inertia, found)
+            assert self._impedance is not None
+            stiffness = command.stiffness_matrix
+            damping = self._impedance.joints.damping(stiffness, inertia)
+            pull = stiffness @ (command.reference - joints).unsqueeze(-1)
+            fused = pull + damping @ (command.velocity - velocities).unsqueeze(-1)
+            rate = torch.maximum(rate, fastest(torch.linalg.solve(inertia, damping)))
+            return replace(found, fused=fused.squeeze(-1), rate=rate)
         except TPGMMError:
             if not bool(self._drive.dt.any()):  # the first step
                 raise
         lost = torch.full_like(joints, torch.nan)
         return Found(lost, bias, lost, self._drive.rate, command.estimate)
-
-    def _followed(
-        self,
-        command: Command,
-        joints: Tensor,
-        velocities: Tensor,
-        inertia: Tensor,
-        found: Found,
-    ) -> Found:
-        """Stiffness and damping of the covariance, where no force is expected."""
-        assert self._impedance is not None
-        stiffness = command.stiffness_matrix
-        damping = self._impedance.joints.damping(stiffness, inertia)
-        pull = stiffness @ (command.reference - joints).unsqueeze(-1)
-        fused = pull + damping @ (command.velocity - velocities).unsqueeze(-1)
-        rate = torch.maximum(found.rate, fastest(torch.linalg.solve(inertia, damping)))
-        return replace(found, fused=fused.squeeze(-1), rate=rate)
 
     def _pressed(
         self,
@@ -402,34 +402,27 @@ class TorqueController(Controller):
         found: Found,
     ) -> Found:
         """The product of all rows."""
-        time, frames, joints = command.time, self.holding.frames, state.joints
-        estimate, integrals = command.estimate, self._drive.integrals
-        if self._gaussians is not None:
-            passed = torch.where(dt > 0, (time - self._drive.time) / dt, 0.0)
-            pace = passed.clamp(0.0, FASTEST_PACE)
-            rows = [self._gaussians.rows(time, pace, state, frames, mechanics)]
-        else:
-            moving = command.velocity - mechanics.velocity[..., : joints.shape[-1]]
-            away = estimate.joints - joints
-            rows = [joint_rows(away, moving, estimate.covariance, mechanics)]
-        rates, errors = [found.rate], []
+        time, frames, last = command.time, self.holding.frames, self._drive
+        assert self._gaussians is not None
+        pace = torch.where(dt > 0, (time - last.time) / dt, 0.0).clamp(0.0, FASTEST_PACE)
+        rows = [self._gaussians.rows(time, pace, state, frames, mechanics)]
+        rates, forces = [found.rate], []
         for one in self._skill.expected_forces(time):
-            axes, body = (
-                force_axes(one.operator, state, frames),
-                list(self._bodies).index((one.operator.link, None, False)),
-            )
-            integral = integrals.get(one.operator, torch.zeros_like(one.force))
+            axes = force_axes(one.operator, state, frames)
+            body = list(self._bodies).index((one.operator.link, None, False))
+            integral = last.integrals.get(one.operator, torch.zeros_like(one.force))
             rows.append(force_row(one, axes, integral, body, mechanics, self._gains))
             rates.append(rows[-1].rate)
-            errors.append((one, axes))
-        fused, covariance = fused_torque(rows, found.held, mechanics)
-        if self._gaussians is not None:
-            compliance = torch.linalg.inv(self._stiffness[0])
-            away = (compliance @ fused.unsqueeze(-1)).squeeze(-1)
-            spread = compliance @ covariance @ compliance
-            estimate = Estimate(joints + away, spread, estimate.activation)
+            forces.append((one, axes))
+        fused, covariance = fused_torque(rows, mechanics)
+        compliance = torch.linalg.inv(self._stiffness[0])
+        estimate = Estimate(
+            state.joints + (compliance @ fused.unsqueeze(-1)).squeeze(-1),
+            compliance @ covariance @ compliance,
+            self._gaussians.skill.weights_at(time),
+        )
         rate = torch.stack(rates).amax(0)
-        return replace(found, fused=fused, rate=rate, estimate=estimate, forces=errors)
+        return replace(found, fused=fused, rate=rate, estimate=estimate, forces=forces)
 
     def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
         """Integrals of the errors of forces in contact, at most as large as the forces."""

@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
@@ -49,11 +50,9 @@ __all__ = [
     "TorqueRows",
     "fastest",
     "force_axes",
-    "force_bodies",
     "force_row",
     "fused_torque",
     "jacobians",
-    "joint_rows",
 ]
 
 #: Directions in which links move by less than this share of what their axes suggest are given
@@ -81,8 +80,6 @@ class Mechanics:
 
     Parameters
     ----------
-    inertia : Tensor of shape (..., n, n)
-        ``H``.
     inverse : Tensor of shape (..., n, n)
         ``H^-1``.
     mobility : Tensor of shape (..., B, 6, 6)
@@ -95,9 +92,12 @@ class Mechanics:
         ``J qd``.
     stiffness, damping : Tensor of shape (..., N, N)
         Block by block.
+    held : Tensor of shape (..., n)
+        ``-D_q qd``, the torque of a robot that is held.
+    rate : Tensor of shape (...)
+        The fastest of the damping [1/s].
     """
 
-    inertia: Tensor
     inverse: Tensor
     mobility: Tensor
     consistent: Tensor
@@ -105,6 +105,8 @@ class Mechanics:
     velocity: Tensor
     stiffness: Tensor
     damping: Tensor
+    held: Tensor
+    rate: Tensor
 
     @classmethod
     def at(
@@ -128,45 +130,32 @@ class Mechanics:
         stiffness : tuple of Tensor of shapes (..., n, n) and (..., B, 6, 6), optional
             Of joints and links, by default those of the gains for this state.
         """
-        factor = gaussians.cholesky(inertia, "the inertia of the robot")
-        inverse = torch.cholesky_inverse(factor)
+        inverse = torch.cholesky_inverse(gaussians.cholesky(inertia, "the inertia"))
         accelerations = jacobians @ inverse.unsqueeze(-3)
         mobility = accelerations @ jacobians.mT
-        masses, seen_six = _inverse(mobility)
-        if stiffness is None:
-            stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(mobility)
-        joint, link = stiffness
+        masses, seen = _inverse(mobility)
+        stiff = gains.joint_stiffness(inertia), gains.link_stiffness(mobility)
+        joint, link = stiffness or stiff
         twice = 2 * gains.damping_ratio
+        joint_damping = twice * geometric_mean(inertia, joint)
+        link_damping = twice * geometric_mean(link, masses)
+        rates = [
+            fastest(inverse @ joint_damping).unsqueeze(-1),
+            fastest(mobility @ link_damping),
+        ]
         eye = torch.eye(inertia.shape[-1]).to(inertia).expand_as(inertia)
         turned = (jacobians @ velocities[..., None, :, None]).flatten(-3)
         return cls(
-            inertia,
             inverse,
             mobility,
             torch.cat((eye, (masses @ accelerations).flatten(-3, -2)), -2),
-            _blocks(eye, seen_six),
+            _blocks(eye, seen),
             torch.cat((velocities, turned), -1),
             _blocks(joint, link),
-            _blocks(
-                twice * geometric_mean(inertia, joint), twice * geometric_mean(link, masses)
-            ),
+            _blocks(joint_damping, link_damping),
+            -(joint_damping @ velocities.unsqueeze(-1)).squeeze(-1),
+            torch.cat(rates, -1).amax(-1),
         )
-
-    @property
-    def joint_damping(self) -> Tensor:
-        """``D_q`` (..., n, n)."""
-        n = self.inertia.shape[-1]
-        return self.damping[..., :n, :n]
-
-    @property
-    def rate(self) -> Tensor:
-        """The fastest rate of the damping (...), of joints and links [1/s]."""
-        n = self.inertia.shape[-1]
-        rates = [fastest(self.inverse @ self.joint_damping)]
-        for b in range(self.mobility.shape[-3]):
-            rows = slice(n + 6 * b, n + 6 * b + 6)
-            rates.append(fastest(self.mobility[..., b, :, :] @ self.damping[..., rows, rows]))
-        return torch.stack(rates).amax(0)
 
 
 def _inverse(mobility: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,12 +177,10 @@ def _inverse(mobility: Tensor) -> tuple[Tensor, Tensor]:
 def _blocks(first: Tensor, others: Tensor) -> Tensor:
     """Matrices (..., n, n) and (..., B, 6, 6) on the diagonal of one."""
     n, count = first.shape[-1], others.shape[-3]
-    whole = first.new_zeros(*first.shape[:-2], n + 6 * count, n + 6 * count)
-    whole[..., :n, :n] = first
-    for b in range(count):
-        rows = slice(n + 6 * b, n + 6 * b + 6)
-        whole[..., rows, rows] = others[..., b, :, :]
-    return whole
+    apart = torch.eye(count).to(first)[:, None, :, None]
+    second = (others.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
+    more = 6 * count
+    return pad(first, (0, more, 0, more)) + pad(second, (n, 0, n, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,16 +234,22 @@ class LocalGaussians:
                 )
         with torch.inference_mode(False):
             self.conditionals = Conditionals.stacked(skill.fused)
-        self.marginals, self.stack = skill.marginals, Stack(*operators)
+        self.skill, self.marginals, self.stack = skill, skill.marginals, Stack(*operators)
         self._starts = self.stack.quaternion_starts(kinematics)
         self._kinematics = kinematics
         #: What the rows of :class:`Mechanics` are of: which of the six are asked for.
-        self.bodies = force_bodies(skill.operators)
-        for leaf in members:
-            if isinstance(leaf, PoseOperator):
-                body, turns = _body(leaf, kinematics), leaf.gain is not None
-                place, turn = self.bodies.get(body, (False, False))
-                self.bodies[body] = place or not turns, turn or turns
+        self.bodies: dict[Body, tuple[bool, bool]] = {}
+        poses = [
+            (_body(x, kinematics), x.gain is None)
+            for x in members
+            if isinstance(x, PoseOperator)
+        ]
+        forces = [
+            ((x.link, None, False), True) for x in skill.operators if isinstance(x, Wrench)
+        ]
+        for body, is_place in [*forces, *poses]:
+            place, turn = self.bodies.get(body, (False, False))
+            self.bodies[body] = place or is_place, turn or not is_place
         index: list[int] = []
         self._tangents: list[tuple[int, Any]] = []
         labels, noise = [], []  # operator, leaf and three coordinates that rows belong to
@@ -283,10 +276,9 @@ class LocalGaussians:
         if isinstance(leaf, Canonical):
             return list(leaf.columns(self._kinematics.joint_names))
         assert isinstance(leaf, PoseOperator)
-        first = self._kinematics.n_joints + 6 * list(self.bodies).index(
-            _body(leaf, self._kinematics)
-        )
-        return [first + 3 * (leaf.gain is not None) + i for i in range(3)]
+        body = list(self.bodies).index(_body(leaf, self._kinematics))
+        first = self._kinematics.n_joints + 6 * body + 3 * (leaf.gain is not None)
+        return [first, first + 1, first + 2]
 
     def mixed(self, time: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Means (..., D), their time derivatives and covariances of the local coordinates.
@@ -297,8 +289,7 @@ class LocalGaussians:
         present : Tensor of shape (..., D)
             Present coordinates, to the side of which quaternions are brought.
         """
-        one, marginals = self.conditionals, self.marginals
-        weights = torch.softmax(marginals.log_activation(time.unsqueeze(-1)), -1)
+        one, marginals, weights = self.conditionals, self.marginals, self.skill.weights_at(time)
         mean, gain, covariance = one.at(time), one.gain, one.covariance
         if self._starts:
             signs = quaternions.hemisphere_signs(mean, present.unsqueeze(-2), self._starts)
@@ -376,17 +367,6 @@ class LocalGaussians:
         return turns
 
 
-def force_bodies(operators: Sequence[Operator]) -> dict[Body, tuple[bool, bool]]:
-    """Links of forces, and whether their positions and turns are asked for.
-
-    Parameters
-    ----------
-    operators : sequence of Operator
-    """
-    forces = [one for one in operators if isinstance(one, Wrench)]
-    return {(one.link, None, False): (True, False) for one in forces}
-
-
 def jacobians(
     bodies: Mapping[Body, tuple[bool, bool]], state: RobotState, frames: Mapping[str, Frame]
 ) -> Tensor:
@@ -412,32 +392,10 @@ def jacobians(
             jacobian = state.jacobian(link)
         else:  # an object that is free
             jacobian = torch.zeros_like(state.jacobians[..., 0, :, :])
-        if not (place and turn):
-            asked = torch.tensor([place] * 3 + [turn] * 3).to(jacobian).unsqueeze(-1)
-            jacobian = jacobian * asked
-        found.append(jacobian)
+        found.append(jacobian * torch.tensor([place] * 3 + [turn] * 3).to(jacobian)[:, None])
     if not found:
         return state.jacobians[..., :0, :, :]
     return torch.stack(torch.broadcast_tensors(*found), -3)
-
-
-def joint_rows(
-    error: Tensor, moving: Tensor, covariance: Tensor, mechanics: Mechanics
-) -> TorqueRows:
-    """Rows of a Gaussian of the joints: ``tau' = K_q error + D_q moving``.
-
-    Parameters
-    ----------
-    error, moving : Tensor of shape (..., n)
-        How far its mean is away, and how much faster it moves.
-    covariance : Tensor of shape (..., n, n)
-    mechanics : Mechanics
-    """
-    n = error.shape[-1]
-    stiffness, damping = mechanics.stiffness[..., :n, :n], mechanics.joint_damping
-    targets = stiffness @ error.unsqueeze(-1) + damping @ moving.unsqueeze(-1)
-    unit = mechanics.consistent[..., :n, :]
-    return TorqueRows(unit, targets.squeeze(-1), stiffness @ covariance @ stiffness.mT)
 
 
 def fastest(rates: Tensor) -> Tensor:
@@ -448,8 +406,6 @@ def fastest(rates: Tensor) -> Tensor:
     rates : Tensor of shape (..., m, m)
         ``H^-1 D``.
     """
-    if rates.shape[-3:-2] == (0,):
-        return rates.new_zeros(rates.shape[:-2])
     return torch.linalg.eigvals(rates).real.amax(-1)
 
 
@@ -492,7 +448,7 @@ def force_row(
     mechanics : Mechanics
     gains : TorqueGains
     """
-    first = mechanics.inertia.shape[-1] + 6 * body
+    first = mechanics.inverse.shape[-1] + 6 * body
     rows, share = slice(first, first + 3), one.share.clamp_min(LEAST_SHARE)[..., None]
     mobility = axes @ mechanics.mobility[..., body, :3, :3] @ axes.mT
     masses = 1 / mobility.diagonal(dim1=-2, dim2=-1).clamp_min(LEAST_MOBILITY)
@@ -509,21 +465,18 @@ def force_row(
     )
 
 
-def fused_torque(
-    rows: Sequence[TorqueRows], held: Tensor, mechanics: Mechanics
-) -> tuple[Tensor, Tensor]:
+def fused_torque(rows: Sequence[TorqueRows], mechanics: Mechanics) -> tuple[Tensor, Tensor]:
     """Mean (..., n) and covariance (..., n, n) of the product of all rows, and of a prior.
 
     Parameters
     ----------
     rows : sequence of TorqueRows
-    held : Tensor of shape (..., n)
-        Mean of the prior, of precision ``PRIOR H^-1``: the torque of a robot that is held. It
-        counts where no row does.
     mechanics : Mechanics
+        The prior, which counts where no row does, is the torque of a robot that is held, with
+        the precision ``PRIOR H^-1``.
     """
     precision = PRIOR * mechanics.inverse
-    vector = precision @ held.unsqueeze(-1)
+    vector = precision @ mechanics.held.unsqueeze(-1)
     for one in rows:
         more, towards, _ = gaussians.information(
             one.consistent, one.targets.unsqueeze(-1), one.covariance

@@ -94,6 +94,28 @@ def test_what_cannot_be_right_fades_to_gravity_and_damping_with_a_reason():
     assert all((one - last.torque).abs().max() < 0.1 for one in again)  # it fades in again
 
 
+def test_dynamics_that_fail_hold_the_last_known_bias_until_they_are_back():
+    fails = []
+
+    def sometimes(q, qd):
+        inertia, bias = dynamics()(q, qd)
+        return (inertia * np.nan, bias * np.nan) if fails else (inertia, bias)
+
+    control = TorqueController(
+        skill([*WIPING, FORCE], POSTURE), POSTURE, FRAMES, dynamics=sometimes, bounds=None
+    )
+    still = {"velocities": np.zeros(7), "wrenches": NONE}
+    torques = [control.step(0.002, POSTURE, **still).torque for _ in range(50)]
+    fails.append(True)
+    commands = [control.step(0.002, POSTURE, **still) for _ in range(50)]
+    assert "no finite torque" in commands[-1].reason()
+    fails.clear()
+    commands += [control.step(0.002, POSTURE, **still) for _ in range(50)]
+    assert commands[-1].status == "running"
+    torques = torch.stack(torques + [one.torque for one in commands])
+    assert torques.isfinite().all() and torques.diff(dim=0).abs().max() < 0.2
+
+
 def test_a_hundred_hertz_are_refused_and_two_hundred_and_fifty_are_not():
     for dt, status in ((0.01, "holding"), (0.004, "running")):
         control = controller(at=POSTURE)

@@ -59,7 +59,7 @@ def torque(model, q, gains, forces=()):
     for one in model.expected_forces(time):
         axes = force_axes(one.operator, state, FRAMES)
         rows.append(force_row(one, axes, 0.0, 0, mechanics, gains))
-    return fused_torque(rows, REST, mechanics)[0].numpy(), mechanics
+    return fused_torque(rows, mechanics)[0].numpy(), mechanics
 
 
 def test_the_inverse_is_the_dynamically_consistent_one_of_mujoco():
