@@ -32,7 +32,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("regression",),
         ("contact", "events", "skills"),
         ("control",),
-        ("estimator",),
+        ("estimator", "torque"),
         ("corrections", "persistence", "structure"),
     ),
     "tpgmm_datasets": (
