@@ -84,6 +84,7 @@ def run(true_height, **settings):
     return np.array(rows).T
 
 
+pressed = {}
 plt.style.use(STYLE)
 figure, axes = plt.subplots(
     2, 2, figsize=(10, 5), sharex=True, sharey="row", layout="constrained"
@@ -94,7 +95,8 @@ for column, (title, settings) in zip(axes.T, pairs, strict=True):
         force, height = run(0.3 + 1e-3 * error, **settings)
         column[0].plot(time, force, color=color, label=f"board {error:+} mm")
         column[1].plot(time, height, color=color)
-        print(f"{title}, board {error:+} mm: {force[(time > 2.2) & (time < 4.3)].mean():.1f} N")
+        pressed[title, error] = force[(time > 2.2) & (time < 4.3)].mean()
+        print(f"{title}, board {error:+} mm: {pressed[title, error]:.1f} N")
     column[0].axhline(8, color="0.6", linestyle=":")
     column[1].axhline(0, color="0.6", linestyle=":")
     column[0].set_title(title)

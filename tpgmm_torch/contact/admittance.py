@@ -38,15 +38,15 @@ class Admittance:
     Parameters
     ----------
     damping : float, default=400.0
-        B: force per speed [N s/m]. The loop is stable while the stiffness of surface, tool and
+        Force per speed, B [N s/m]. The loop is stable while the stiffness of surface, tool and
         drives in series, times the delay of the loop, is well below it: at 7 N/mm and 20 ms
         that is 140 N s/m.
     speed : float, default=0.1
-        v: the most by which an offset changes [m/s].
+        The most by which an offset changes, v [m/s].
     depth : float, default=0.02
         The largest offset [m]: how wrong the place of a surface may be.
     release : float, default=0.5
-        T: time constant in which offsets are given up where no contact is expected [s].
+        Time constant T in which offsets are given up where no contact is expected [s].
 
     Raises
     ------
@@ -83,7 +83,7 @@ class Offsets:
         self,
         expected: Sequence[ExpectedForce],
         wrenches: Wrenches,
-        state: RobotState,
+        state: RobotState | None,
         frames: Mapping[str, Frame],
         dt: Tensor,
     ) -> Self:
@@ -95,8 +95,8 @@ class Offsets:
             Of this tick. Operators that are no longer among them are given up.
         wrenches : Wrenches
             Robots without a fresh one keep their offsets.
-        state : RobotState
-            Of the robots, without offsets.
+        state : RobotState or None
+            Of the robots, without offsets, where axes are those of links.
         frames : mapping of str to Frame
         dt : Tensor of shape (...)
             Since the last tick [s]; 0 for robots that are held.

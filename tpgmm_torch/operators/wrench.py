@@ -116,12 +116,13 @@ class Wrench(Operator):
             raise UnknownNameError("wrench", self.link, where, state.wrenches)
         return state.wrenches[self.link][..., :3]
 
-    def pose(self, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
-        """The pose of the frame."""
-        if self.frame in state.links:
+    def pose(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Frame:
+        """The pose of the frame; only that of a link needs the state."""
+        links = () if state is None else state.links
+        if state is not None and self.frame in links:
             return state.pose(self.frame)
         if self.frame not in frames:
-            known = [*frames, *state.links]
+            known = [*frames, *links]
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
 
