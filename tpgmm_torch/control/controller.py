@@ -59,7 +59,6 @@ from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
-from tpgmm_torch.control.situations import completed_frames, report_start
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
@@ -73,6 +72,7 @@ from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.servo import Flags
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.skills.situations import completed_frames, report_start
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]

@@ -160,7 +160,9 @@ class Gates:
     @classmethod
     def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:
         """At times (B,) of a skill; without enforcement all conditions count as met."""
-        known = tuple(gate for gate in gates if time.min() < gate.time <= end)
+        first = float(time.min())
+        later = (gate for gate in gates if first < gate.time <= end)
+        known = tuple(replace(gate, back=max(gate.back, first)) for gate in later)
         last = np.nextafter(end, -np.inf)  # at the end itself a robot is done
         stops = [min(g.time, last) if enforced and g.until else np.inf for g in known]
         closed = np.minimum.accumulate([np.inf, *stops[::-1]])[::-1]

@@ -36,6 +36,18 @@ def test_each_robot_of_a_batch_goes_on_tries_again_or_gives_up():
     assert max(shares_of_bounds(world, FETCH.motion_bounds)) <= 1 + 1e-6
 
 
+@CLOCKS
+def test_without_conditions_nothing_is_new(clock):
+    plain, same = (
+        World(one, clock=clock) for one in (skill("pick"), Sequence([skill("pick")]))
+    )
+    for k in range(60):
+        one, other = (world.step() for world in (plain, same))
+        assert torch.equal(one.reference, other.reference) and one.status == other.status
+        if 20 <= k < 35:  # somebody holds it
+            plain.hand = same.hand = plain.references[20]
+
+
 def test_robots_do_not_influence_each_other():
     together, alone = World(FETCH, fails=(1, 9, 0)), World(FETCH, fails=(1,), single=True)
     for _ in range(150):
