@@ -26,8 +26,6 @@ __all__ = ["Gates", "Grip", "Moment"]
 #: Share of its way with a hand by which an object that is held may be off, as of holds that
 #: are found in how objects move.
 SHARE = 0.4
-#: While conditions are met for less than :data:`LOST_TIME`.
-SURE = "until that is certain"
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,8 +211,9 @@ class Gates:
         new = replace(
             new, grips=new._gripped(moment), waited=waited, met_for=stands * new.met_for
         )
-        kept = {row: text for row, text in self.reasons.items() if stands[row] and not at[row]}
-        return new._decided(at, dt, moment, kept) if stands.any() else replace(new, reasons={})
+        waits = (stands & ~at) | self.failed
+        kept = {row: text for row, text in self.reasons.items() if waits[row]}
+        return new._decided(at, dt, moment, kept) if at.any() else replace(new, reasons=kept)
 
     def _opened(self, rows: Flags, time: Any) -> Self:
         """Some robots have passed the next gate, and go on from a time."""
@@ -245,13 +244,13 @@ class Gates:
         opens, goto, waited = at & False, self.goto.copy(), self.waited.copy()
         for number in np.unique(self.index[at]).tolist():
             gate = self.gates[number]
-            unmet = {_name(each): self._unmet(each, gate, moment) for each in gate.until}
+            every = [self._unmet(each, gate, moment) for each in gate.until]
             for row in np.flatnonzero(at & (self.index == number)).tolist():
-                first = next((name for name, why in unmet.items() if why[row]), None)
-                met_for[row] = 0.0 if first else met_for[row] + dt[row]
-                reasons[row] = f"{first!r} not met: {unmet[first][row]}" if first else SURE
+                unmet = next(filter(None, (texts[row] for texts in every)), "")
+                met_for[row] = 0.0 if unmet else met_for[row] + dt[row]
                 opens[row] = met_for[row] >= LOST_TIME
-                if first and waited[row] >= gate.timeout:
+                reasons[row] = unmet or f"met for {met_for[row]:.1f} s of {LOST_TIME:g} s"
+                if unmet and waited[row] >= gate.timeout:
                     tries[row, number] += 1
                     count = int(tries[row, number])
                     failed[row] = count > gate.retries
@@ -276,26 +275,30 @@ class Gates:
         return new._opened(opens, onward)
 
     def _unmet(self, condition: Condition, gate: Gate, moment: Moment) -> list[str]:
-        """Why a condition is not met by each robot (B,); empty where it is."""
+        """Why a condition is not met by each robot (B,), in words; empty where it is."""
+        name, met, why = condition, moment.no_robot, "it is false"
         if condition in ("held", "free"):
             holds = gate.held if condition == "held" else gate.freed
             each = [self._not_held(hold, moment, condition == "free") for hold in holds]
-            return [next(filter(None, texts), "") for texts in zip(*each, strict=True)]
-        why, met = "it is false", moment.no_robot
+            reasons = [next(filter(None, texts), "") for texts in zip(*each, strict=True)]
+            return [why and f"{name!r} not met: {why}" for why in reasons]
         if condition == "arrived":
-            why, met = "joints move, or are not at their reference", moment.arrived
+            met, why = moment.arrived, "joints move, or are not at their reference"
         elif isinstance(condition, str):
             link = condition.removeprefix(CONTACT)
-            why = f"{link} touches nothing"
-            if link not in moment.contacts:
-                why = "no contact is measured there"
-            met = moment.contacts.get(link, met)
+            known = link in moment.contacts
+            why = f"{link} touches nothing" if known else "no contact is measured there"
+            met = moment.contacts.get(link, met).expand(met.shape)
         else:
+            name = getattr(condition, "__name__", "a function")
             try:
-                met = torch.as_tensor(condition(moment), dtype=torch.bool)
+                found = torch.as_tensor(condition(moment))
+                if found.dtype != torch.bool:
+                    raise TypeError(f"no bool but {found.dtype}")
+                met = found.expand(met.shape)
             except Exception as error:  # of a user's function, which must not stop the loop
                 why = f"it raised {error!r}"
-        return ["" if one else why for one in _rows(met.expand(moment.arrived.shape))]
+        return ["" if one else f"{name!r} not met: {why}" for one in _rows(met)]
 
     def _not_held(self, hold: Hold, moment: Moment, free: bool) -> list[str]:
         """Why an object is not held, or not free, by each robot (B,)."""
@@ -314,10 +317,6 @@ class Gates:
             else f"{name} is {1e3 * away:.0f} mm from where {hold.link} would carry it"
             for ok, gone, away in zip(*map(_rows, table), strict=True)
         ]  # fmt: skip
-
-
-def _name(condition: Condition) -> str:
-    return condition if isinstance(condition, str) else getattr(condition, "__name__", "it")
 
 
 def _rows(values: Tensor) -> Any:
