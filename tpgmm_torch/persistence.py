@@ -265,6 +265,11 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
 
 def _described(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
     """An object as the name of its class and its fields."""
+    if isinstance(thing, FunctionType | MethodType):
+        raise ModelFileError(
+            f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
+            "conditions by name ('arrived', 'held', ...), or make the sequence where it runs"
+        )
     if isinstance(thing, np.generic):
         return encode(thing.item())
     name = type(thing).__name__
@@ -305,11 +310,6 @@ def _parts(thing: Any) -> dict[str, Any]:
         return {"skill": thing.skill, "points": thing.points, "fade": thing.fade}
     if is_dataclass(thing):
         return {each.name: getattr(thing, each.name) for each in fields(thing)}
-    if isinstance(thing, FunctionType | MethodType):
-        raise ModelFileError(
-            f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
-            "conditions by name ('arrived', 'held', ...), or make the sequence where it runs"
-        )
     raise ModelFileError(
         f"{type(thing).__name__} cannot be saved: make an operator a frozen dataclass, give a "
         "robot config() and a classmethod from_config()"

@@ -62,7 +62,6 @@ from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
-from tpgmm_torch.control.situations import completed_frames, report_start
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
@@ -77,6 +76,7 @@ from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.servo import Flags
 from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.sensing.wrenches import Wrenches
+from tpgmm_torch.skills.situations import completed_frames, report_start
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]
@@ -469,13 +469,15 @@ class Controller:
     def _find(self, row: int, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""
         now, gates = float(self._progress.time[row]), self._gates
+        if gates.failed[row]:
+            return None
         within = float(gates.since[row]), float(gates.stop[row])
         like = self.reference.detach()
         return self._places.find(row, posture, now, self.holding, like, within)
 
     def _gate(self, tick: _Tick) -> None:
         """Robots that wait for the end of one skill to be what the next one needs."""
-        if tick.first or not self._gates.gates:
+        if tick.first or (self._gates.index == len(self._gates.gates)).all():
             return
         progress, postures = self._progress, self._postures(tick, measured=True)
         passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
@@ -483,7 +485,7 @@ class Controller:
         for robots in (tick.halted, tick.late):
             ready = ready if robots is None else ready & ~robots
         moment = None
-        if self._inputs is not None or not self._trusts:
+        if self._inputs is not None and np.isfinite(self._gates.stop).any():
             moment = self._moment(tick, postures)
         self._gates = gates = self._gates.advance(progress.time, passed, ready, moment)
         self._progress = progress.gated(gates.stop, gates.goto)
@@ -502,10 +504,9 @@ class Controller:
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
         arrived = self._tensor(self._progress.arrived(*arrays))
         none = torch.zeros_like(reference[..., 0], dtype=torch.bool)
-        unseen: dict[str, Tensor] = {}
-        if self._inputs is not None:
-            unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
-            unseen |= self._inputs.lost
+        assert self._inputs is not None
+        unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
+        unseen |= self._inputs.lost
         return Moment(
             self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
             self.holding, getattr(self, "contacts", {}), arrived,

@@ -26,8 +26,6 @@ __all__ = ["Gates", "Grip", "Moment"]
 #: Share of its way with a hand by which an object that is held may be off, as of holds that
 #: are found in how objects move.
 SHARE = 0.4
-#: While conditions are met for less than :data:`LOST_TIME`.
-SURE = "until that is certain"
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +158,9 @@ class Gates:
     @classmethod
     def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:
         """At times (B,) of a skill; without enforcement all conditions count as met."""
-        known = tuple(gate for gate in gates if time.min() < gate.time <= end)
+        first = float(time.min())
+        later = (gate for gate in gates if first < gate.time <= end)
+        known = tuple(replace(gate, back=max(gate.back, first)) for gate in later)
         last = np.nextafter(end, -np.inf)  # at the end itself a robot is done
         stops = [min(g.time, last) if enforced and g.until else np.inf for g in known]
         closed = np.minimum.accumulate([np.inf, *stops[::-1]])[::-1]
@@ -211,8 +211,9 @@ class Gates:
         new = replace(
             new, grips=new._gripped(moment), waited=waited, met_for=stands * new.met_for
         )
-        kept = {row: text for row, text in self.reasons.items() if stands[row] and not at[row]}
-        return new._decided(at, dt, moment, kept) if stands.any() else replace(new, reasons={})
+        waits = (stands & ~at) | self.failed
+        kept = {row: text for row, text in self.reasons.items() if waits[row]}
+        return new._decided(at, dt, moment, kept) if at.any() else replace(new, reasons=kept)
 
     def _opened(self, rows: Flags, time: Any) -> Self:
         """Some robots have passed the next gate, and go on from a time."""
@@ -239,61 +240,70 @@ class Gates:
 
     def _decided(self, at: Flags, dt: Array, moment: Moment, reasons: dict[int, str]) -> Self:
         """Robots at their gates wait, go on, go back, or give up."""
-        met_for, tries, failed = self.met_for.copy(), self.tries.copy(), self.failed.copy()
-        opens, goto, waited = at & False, self.goto.copy(), self.waited.copy()
+        why = self._asked(at, moment)
+        number = np.minimum(self.index, len(self.gates) - 1)
+        each = np.array([(g.timeout, g.retries, g.back, g.onward) for g in self.gates])
+        timeout, retries, back, onward = each[number].T
+        met = at & np.array([not text for text in why])
+        met_for = np.where(at, met * (self.met_for + dt), self.met_for)
+        late = at & ~met & (self.waited >= timeout)
+        tries = self.tries + late[:, None] * np.eye(len(self.gates), dtype=int)[number]
+        count = np.take_along_axis(tries, number[:, None], 1)[:, 0]
+        fails, goes, opens = late & (count > retries), late & (count <= retries), met
+        opens = opens & (met_for >= LOST_TIME)
+        for row in np.flatnonzero(at & ~goes & ~opens).tolist():
+            after = f" after {count[row]} tries" if fails[row] and count[row] > 1 else ""
+            text = f"met for {met_for[row]:.1f} s of {LOST_TIME:g} s"
+            reasons[row] = why[row].replace(" not met", f" not met{after}", 1) or text
+        kept = torch.from_numpy(~goes).view(moment.arrived.shape)
+        times = [gate.time for gate in self.gates]
+        return replace(
+            self,
+            index=np.where(goes, np.searchsorted(times, back, side="right"), self.index),
+            waited=np.where(goes | opens, 0.0, self.waited),
+            met_for=np.where(goes | opens, 0.0, met_for),
+            tries=tries,
+            failed=self.failed | fails,
+            goto=np.where(goes, back, self.goto),
+            reasons=reasons,
+            grips={hold: grip.kept(kept) for hold, grip in self.grips.items()},
+        )._opened(opens, onward)
+
+    def _asked(self, at: Flags, moment: Moment) -> list[str]:
+        """Why robots (B,) at their gates may not go on; empty where they may."""
+        why = [""] * len(at)
         for number in np.unique(self.index[at]).tolist():
             gate = self.gates[number]
-            unmet = {_name(each): self._unmet(each, gate, moment) for each in gate.until}
+            every = [self._unmet(each, gate, moment) for each in gate.until]
             for row in np.flatnonzero(at & (self.index == number)).tolist():
-                first = next((name for name, why in unmet.items() if why[row]), None)
-                met_for[row] = 0.0 if first else met_for[row] + dt[row]
-                reasons[row] = f"{first!r} not met: {unmet[first][row]}" if first else SURE
-                opens[row] = met_for[row] >= LOST_TIME
-                if first and waited[row] >= gate.timeout:
-                    tries[row, number] += 1
-                    count = int(tries[row, number])
-                    failed[row] = count > gate.retries
-                    goto[row] = np.nan if failed[row] else gate.back
-                    after = f" after {count} tries" if count > 1 else ""
-                    reasons[row] = reasons[row].replace(" not met", f" not met{after}", 1)
-        back = np.isfinite(goto) & at
-        moved, times = back | opens, [gate.time for gate in self.gates]
-        kept = torch.from_numpy(~back).view(moment.arrived.shape)
-        new = replace(
-            self,
-            index=np.where(back, np.searchsorted(times, goto, side="right"), self.index),
-            waited=np.where(moved, 0.0, waited),
-            met_for=np.where(moved, 0.0, met_for),
-            tries=tries,
-            failed=failed,
-            goto=goto,
-            reasons={row: text for row, text in reasons.items() if not moved[row]},
-            grips={hold: grip.kept(kept) for hold, grip in self.grips.items()},
-        )
-        onward = np.array([*(gate.onward for gate in self.gates), np.inf])[self.index]
-        return new._opened(opens, onward)
+                why[row] = next(filter(None, (texts[row] for texts in every)), "")
+        return why
 
     def _unmet(self, condition: Condition, gate: Gate, moment: Moment) -> list[str]:
-        """Why a condition is not met by each robot (B,); empty where it is."""
-        if condition in ("held", "free"):
-            holds = gate.held if condition == "held" else gate.freed
-            each = [self._not_held(hold, moment, condition == "free") for hold in holds]
-            return [next(filter(None, texts), "") for texts in zip(*each, strict=True)]
-        why, met = "it is false", moment.no_robot
-        if condition == "arrived":
-            why, met = "joints move, or are not at their reference", moment.arrived
-        elif isinstance(condition, str):
-            link = condition.removeprefix(CONTACT)
-            why = f"{link} touches nothing"
-            if link not in moment.contacts:
-                why = "no contact is measured there"
-            met = moment.contacts.get(link, met)
+        """Why a condition is not met by each robot (B,), in words; empty where it is."""
+        if not isinstance(condition, str):
+            name, met, why = (
+                getattr(condition, "__name__", "a function"),
+                *_called(condition, moment),
+            )
+        elif condition in ("held", "free"):
+            return self._not_all_held(condition, gate, moment)
+        elif condition == "arrived":
+            name, met = condition, moment.arrived
+            why = "joints move, or are not at their reference"
         else:
-            try:
-                met = torch.as_tensor(condition(moment), dtype=torch.bool)
-            except Exception as error:  # of a user's function, which must not stop the loop
-                why = f"it raised {error!r}"
-        return ["" if one else why for one in _rows(met.expand(moment.arrived.shape))]
+            name, link = condition, condition.removeprefix(CONTACT)
+            met = moment.contacts.get(link, moment.no_robot).expand(moment.arrived.shape)
+            known = link in moment.contacts
+            why = f"{link} touches nothing" if known else "no contact is measured there"
+        return ["" if one else f"{name!r} not met: {why}" for one in _rows(met)]
+
+    def _not_all_held(self, condition: str, gate: Gate, moment: Moment) -> list[str]:
+        """Of the objects that are to be held, or free, why the first is not."""
+        free = condition == "free"
+        each = [self._not_held(h, moment, free) for h in (gate.freed if free else gate.held)]
+        reasons = (next(filter(None, texts), "") for texts in zip(*each, strict=True))
+        return [why and f"{condition!r} not met: {why}" for why in reasons]
 
     def _not_held(self, hold: Hold, moment: Moment, free: bool) -> list[str]:
         """Why an object is not held, or not free, by each robot (B,)."""
@@ -314,8 +324,16 @@ class Gates:
         ]  # fmt: skip
 
 
-def _name(condition: Condition) -> str:
-    return condition if isinstance(condition, str) else getattr(condition, "__name__", "it")
+def _called(condition: Any, moment: Moment) -> tuple[Tensor, str]:
+    """For which robots (...) a function is true, and why it is not for others."""
+    try:
+        found = torch.as_tensor(condition(moment))
+        if found.dtype == torch.bool:
+            return found.expand(moment.arrived.shape), "it is false"
+        why = f"it gives no bool but {found.dtype}"
+    except Exception as error:  # of a user's function, which must not stop the loop
+        why = f"it raised {error!r}"
+    return moment.no_robot, why
 
 
 def _rows(values: Tensor) -> Any:

@@ -325,17 +325,18 @@ class Holds:
         seen : mapping of str to Frame
             Where objects are seen, or were seen last.
         """
-        watch, rests = self.watch, {}
-        for name, rest in watch.rests.items():
-            now = Rest.at(rest.seen, joints)
-            rests[name] = replace(
+        where = robots.unsqueeze(-1)
+        rests = {
+            name: replace(
                 rest,
-                pose=choose(robots, now.pose, rest.pose),
-                joints=torch.where(robots.unsqueeze(-1), now.joints, rest.joints),
-                away=torch.where(robots, now.away, rest.away),
+                pose=choose(robots, rest.seen, rest.pose),
+                joints=torch.where(where, joints, rest.joints),
+                away=rest.away.masked_fill(robots, 0.0),
             )
+            for name, rest in self.watch.rests.items()
+        }
         holding = self.holding.released(robots, seen)
-        return replace(self, holding=holding, watch=replace(watch, rests=rests))
+        return replace(self, holding=holding, watch=replace(self.watch, rests=rests))
 
     def _hidden(
         self, joints: Tensor, lost: Mapping[str, Tensor], inputs: Inputs, dt: float | Tensor

@@ -302,8 +302,9 @@ class Holding:
         Parameters
         ----------
         robots : Tensor of bool, of shape (...)
+            For which a separate skill begins.
         joints : Tensor of shape (..., n_joints)
-            [rad or m]
+            Their postures [rad or m].
         """
         frames, state = dict(self.frames), self.kinematics.state(joints)
         for name, held in self.held.items():

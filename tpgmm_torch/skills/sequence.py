@@ -80,37 +80,28 @@ class Sequence(CompositeSkill):
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        skills, count = tuple(self.skills), len(self.skills)
-        names = tuple(self.names) or tuple(map(str, range(count)))
-        seconds = self.timeout if self.fade is None else min(self.fade, self.timeout)
-        if not skills or not 0 < seconds < math.inf:
-            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
-        if len(names) != count or len(set(names)) < count:
-            raise DataError(f"{count} skills need a name each, got {list(names)}")
-        for one, other in pairwise(skills):
-            if one.kinematics.joint_names != other.kinematics.joint_names:
-                raise DataError("the skills of a sequence are of different robots")
-            gap, late = abs(other.begin - one.end), abs(other.begin - one.begin)
-            if (self.fade or PARTS_FADE) < gap < late:
-                raise DataError(
-                    f"a skill that begins at {other.begin:.4g} s cannot follow one that ends "
-                    f"at {one.end:.4g} s: on one clock each begins where the one before ends, "
-                    "and those learned separately each begin at the beginning"
-                )
-        parts = all(_shares_clock(one, other, PARTS_FADE) for one, other in pairwise(skills))
-        several: dict[str, Any] = {"until": self.until or None, "retry": self.retry or 0}
-        for what, value in several.items():
-            several[what] = value if isinstance(value, tuple | list) else [value] * count
-            if len(several[what]) != count:
-                raise DataError(f"{what} has {len(value)} entries for {count} skills: {value}")
+        skills, names = tuple(self.skills), self._checked_names()
+        parts = _are_parts(skills, self.fade or PARTS_FADE)
+        untils = _of_each("until", self.until or None, len(skills))
+        retries = _of_each("retry", self.retry or 0, len(skills))
         for name, value in {
             "skills": skills,
             "names": names,
             "fade": self.fade or (PARTS_FADE if parts else SKILLS_FADE),
-            "until": tuple(map(_conditions, skills, several["until"])),
-            "retry": tuple(_retry(names, *each) for each in enumerate(several["retry"])),
+            "until": tuple(map(_conditions, skills, untils)),
+            "retry": tuple(_retry(names, *each) for each in enumerate(retries)),
         }.items():
             object.__setattr__(self, name, value)
+
+    def _checked_names(self) -> tuple[str, ...]:
+        """Names of the skills, of which there are some; all settings are numbers."""
+        count, seconds = len(self.skills), (self.timeout, self.fade or self.timeout)
+        if not count or not all(0 < one < math.inf for one in seconds):
+            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
+        names = tuple(self.names) or tuple(map(str, range(count)))
+        if len(names) != count or len(set(names)) < count:
+            raise DataError(f"{count} skills need a name each, got {list(names)}")
+        return names
 
     @classmethod
     def parse(
@@ -213,24 +204,15 @@ class Sequence(CompositeSkill):
         if not any(self._separate):
             every = dict.fromkeys(hold for one in self.skills for hold in one.holds)
             return tuple(sorted(every, key=lambda hold: (hold.begin, hold.end)))
-        found: dict[str, list[Hold]] = {}
+        found: list[Hold] = []
         spans = zip(self.skills, self._shifts, self._stretches, strict=True)
         for one, by, (begin, stop) in spans:
             for hold in sorted(one.holds, key=lambda hold: hold.begin):
-                several = found.setdefault(hold.frame, [])
-                early, late = max(hold.begin + by, begin), hold.end + by
-                if late <= early:
-                    continue
-                if several and several[-1].end > early:  # held on from a skill before
-                    last = several.pop()
-                    if last.link != hold.link:
-                        several.append(replace(last, end=early))
-                    early = last.begin if last.link == hold.link else early
-                several.append(
-                    replace(hold, begin=early, end=late if late < stop else math.inf)
-                )
-        merged = (hold for several in found.values() for hold in several)
-        return tuple(sorted(merged, key=lambda hold: hold.begin))
+                late = hold.end + by
+                late = late if late < stop else math.inf
+                if late > (early := max(hold.begin + by, begin)):
+                    found = _held_on(found, replace(hold, begin=early, end=late))
+        return tuple(sorted(found, key=lambda hold: hold.begin))
 
     @cached_property
     def gates(self) -> tuple[Gate, ...]:
@@ -329,27 +311,68 @@ def _open(end: float, edge: float) -> float:
     return end if end < edge else math.inf
 
 
+def _held_on(holds: list[Hold], new: Hold) -> list[Hold]:
+    """Holds, and a later one; an object that is held by then stays so until it begins."""
+    before = [hold for hold in holds if hold.frame == new.frame and hold.end > new.begin]
+    kept = [hold for hold in holds if hold not in before]
+    for hold in before:
+        if hold.link == new.link:
+            new = replace(new, begin=hold.begin)
+        else:
+            kept.append(replace(hold, end=new.begin))
+    return [*kept, new]
+
+
+def _are_parts(skills: tuple[Skill, ...], fade: float) -> bool:
+    """Whether all skills share one clock, of one robot."""
+    for one, other in pairwise(skills):
+        if one.kinematics.joint_names != other.kinematics.joint_names:
+            raise DataError("the skills of a sequence are of different robots")
+        if fade < abs(other.begin - one.end) < abs(other.begin - one.begin):
+            raise DataError(
+                f"a skill that begins at {other.begin:.4g} s cannot follow one that ends at "
+                f"{one.end:.4g} s: on one clock each begins where the one before ends, and "
+                "those learned separately each begin at the beginning"
+            )
+    return all(_shares_clock(one, other, fade) for one, other in pairwise(skills))
+
+
+def _of_each(what: str, value: Any, count: int) -> Any:
+    """A value of each skill."""
+    several = value if isinstance(value, tuple | list) else [value] * count
+    if len(several) != count:
+        raise DataError(f"{what} has {len(several)} entries for {count} skills: {value!r}")
+    return several
+
+
 def _conditions(skill: Skill, given: Any) -> tuple[Condition, ...]:
     """Conditions at the end of a skill, checked."""
-    found, links = list[Condition](), skill.kinematics.links
+    found = list[Condition]()
     for one in given if isinstance(given, tuple | list) else [given or ""]:
         found += filter(None, map(str.strip, one.split("+"))) if isinstance(one, str) else [one]
     for one in found:
-        if isinstance(one, str) and (link := one.partition(CONTACT)[2]):
-            if link not in links:
-                raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
-        elif not callable(one) and one not in CONDITIONS:
-            raise DataError(
-                f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, got "
-                f"{one!r}"
-            )
-    for name, holds in (("held", _held(skill)), ("free", _freed(skill))):
-        if name in found and not holds:
-            raise DataError(
-                f"until {name!r}: no object is {name} by the end of this skill, of which the "
-                f"holds are {[str(hold) for hold in skill.holds]}"
-            )
+        if not callable(one):
+            _check_condition(one, skill)
     return tuple(found)
+
+
+def _check_condition(one: Any, skill: Skill) -> None:
+    """Refuse a condition that cannot be met."""
+    links = skill.kinematics.links
+    link = one.partition(CONTACT)[2] if isinstance(one, str) else ""
+    if link and link not in links:
+        raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
+    if not link and one not in CONDITIONS:
+        raise DataError(
+            f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, got "
+            f"{one!r}"
+        )
+    holds = {"held": _held, "free": _freed}.get(one)
+    if holds is not None and not holds(skill):
+        raise DataError(
+            f"until {one!r}: no object is {one} by the end of this skill, of which the holds "
+            f"are {[str(hold) for hold in skill.holds]}"
+        )
 
 
 def _retry(names: tuple[str, ...], number: int, given: Any) -> tuple[int, int]:

@@ -36,6 +36,18 @@ def test_each_robot_of_a_batch_goes_on_tries_again_or_gives_up():
     assert max(shares_of_bounds(world, FETCH.motion_bounds)) <= 1 + 1e-6
 
 
+@CLOCKS
+def test_without_conditions_nothing_is_new(clock):
+    plain, same = (
+        World(one, clock=clock) for one in (skill("pick"), Sequence([skill("pick")]))
+    )
+    for k in range(60):
+        one, other = (world.step() for world in (plain, same))
+        assert torch.equal(one.reference, other.reference) and one.status == other.status
+        if 20 <= k < 35:  # somebody holds it
+            plain.hand = same.hand = plain.references[20]
+
+
 def test_robots_do_not_influence_each_other():
     together, alone = World(FETCH, fails=(1, 9, 0)), World(FETCH, fails=(1,), single=True)
     for _ in range(150):
@@ -47,9 +59,8 @@ def test_robots_do_not_influence_each_other():
 @CLOCKS
 def test_time_does_not_pass_a_closed_gate(clock):
     asked = [False]
-    sequence = Sequence(
-        list(skills().values())[:2], until=[lambda moment: asked[0], None], timeout=60.0
-    )
+    until = [lambda moment: asked[0], lambda moment: True]
+    sequence = Sequence(list(skills().values())[:2], until=[until, None], timeout=60.0)
     [gate] = sequence.gates
     world = World(sequence, single=True, clock=clock)
     world.run(2.6)
@@ -72,6 +83,8 @@ def test_a_function_that_raises_is_a_reason_and_stops_no_loop():
     world = World(Sequence([skill("pick")], until=broken, timeout=0.5), single=True)
     command = world.run(6.0, lambda command: command.status == "holding")
     assert command.reason() == "'broken' not met: it raised KeyError('lid')"
+    world = World(Sequence([skill("pick")], until=lambda moment: float("nan")), single=True)
+    assert "it gives no bool but torch.float32" in world.run(2.5).reason()
     command = World(Sequence([skill("pick")], until="contact:hand"), single=True).run(2.5)
     assert command.reason() == "'contact:hand' not met: no contact is measured there"
 

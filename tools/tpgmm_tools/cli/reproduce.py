@@ -66,9 +66,9 @@ def reproduce(
     """
     from tpgmm_datasets.tables import trajectories_to_frame, write_table
     from tpgmm_torch.control.rollout import rollout
-    from tpgmm_torch.control.situations import at_first
     from tpgmm_torch.exceptions import DataError, UnknownNameError
     from tpgmm_torch.persistence import load_skill
+    from tpgmm_torch.skills.situations import at_first
     from tpgmm_torch.skills.via_points import ViaPoints
     from tpgmm_torch.skills.ways import Ways
 
