@@ -270,6 +270,18 @@ class TorqueController(Controller):
         if self.command is None and self._bodies and self._gains.integral and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
         speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
+        self._tick, late = None, {**(ages or {}), **self._faults(dt, given, speeds)}
+        command = super().step(dt, joints, frames, holds=holds, ages=late, wrenches=wrenches)
+        known = torch.full_like(speeds, torch.nan)
+        if self._tick is not None and self._tick.joints is not None:
+            known = self._tick.joints
+            if self._gripping is not None:
+                known = torch.where(self._gripping, given, known)
+        self.command = driven = self._driven(command, known, speeds)
+        return driven
+
+    def _faults(self, dt: Any, given: Tensor, speeds: Tensor) -> dict[str, Any]:
+        """Why robots are held, with infinite ages: what is missing, and ticks too long."""
         seconds = dt if isinstance(dt, float | int | Tensor) else 0.0
         late = self._drive.rate * torch.nan_to_num(torch.as_tensor(seconds).to(speeds))
         longest = LONGEST_TICK / float(self._drive.rate.max().clamp_min(1e-9))
@@ -279,22 +291,11 @@ class TorqueController(Controller):
             NO_TORQUE: self._drive.lost,
             LONG_TICK.format(1e3 * longest, 1 / longest): late > LONGEST_TICK,
         }
-        held: dict[str, Any] = {
+        return {
             reason: np.where(robots.numpy(force=True), np.inf, 0.0)
             for reason, robots in faults.items()
             if bool(robots.any())
         }
-        self._tick = None
-        command = super().step(
-            dt, joints, frames, holds=holds, ages={**(ages or {}), **held}, wrenches=wrenches
-        )
-        known = torch.full_like(speeds, torch.nan)
-        if self._tick is not None and self._tick.joints is not None:
-            known = self._tick.joints
-            if self._gripping is not None:
-                known = torch.where(self._gripping, given, known)
-        self.command = driven = self._driven(command, known, speeds)
-        return driven
 
     # Stages that are others where forces are expected: robots are where they are pushed to
 

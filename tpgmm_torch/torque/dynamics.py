@@ -85,6 +85,13 @@ class MujocoDynamics:
         for name in names:
             if name not in known:
                 raise UnknownNameError("joint", name, "the model of the dynamics", known)
+        self._map(robot, known)
+        efforts = _efforts(mujoco, model)[[known.index(name) for name in names]]
+        self.effort = torch.from_numpy(efforts).to(robot.lower)
+
+    def _map(self, robot: Robot, known: list[str]) -> None:
+        """Joints of the model as functions of the joint vector."""
+        model, names = self._model, robot.joint_names
         # what the robot does not know, as objects, stays where it begins
         moved = [name for name in known if name in robot.model.movable]
         index, locked = [known.index(name) for name in moved], robot.config()["locked"]
@@ -98,8 +105,6 @@ class MujocoDynamics:
                 self._start[at] += lead.multiplier * locked.get(lead.joint, 0.0)
         self._columns = np.zeros((model.nv, len(names)))
         self._columns[rows] = self._slopes
-        efforts = _efforts(mujoco, model)[[known.index(name) for name in names]]
-        self.effort = torch.from_numpy(efforts).to(robot.lower)
 
     def __call__(self, joints: Tensor, velocities: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Dynamics.__call__`; robots of a batch one after the other."""
