@@ -161,6 +161,15 @@ CLAIMS = {
             and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
         ),
     ),
+    "plot_19_contact.py": (
+        1,
+        lambda v: (
+            v["model"].operators_[-1].axes == (2,)
+            and max(abs(v["pressed"]["with admittance", e] - 8) for e in (-5, 0, 5)) < 0.2
+            and v["pressed"]["positions alone", -5] == 0
+            and v["pressed"]["positions alone", 5] > 15
+        ),
+    ),
 }
 
 

@@ -45,7 +45,7 @@ def wipe(height: float, x: float, rate: int = 50) -> Demonstration:
     along = 0.2 * np.clip((time - TOUCH) / (LEAVE - TOUCH), 0, 1)
     above = 0.1 * np.clip(np.maximum(TOUCH - time, time - LEAVE) / TOUCH, 0, 1)
     touches = (time >= TOUCH) & (time < LEAVE)
-    joints = np.stack((x - along, 0 * time, height + above), -1)
+    joints = np.stack((x - along, 0.01 * np.sin(time), height + above), -1)
     wrench = np.zeros((len(time), 6))
     wrench[touches, 0], wrench[touches, 2] = -FRICTION * PRESS, -PRESS
     return Demonstration(

@@ -38,15 +38,15 @@ class Admittance:
     Parameters
     ----------
     damping : float, default=400.0
-        B: force per speed [N s/m]. The loop is stable while the stiffness of surface, tool and
+        Force per speed, B [N s/m]. The loop is stable while the stiffness of surface, tool and
         drives in series, times the delay of the loop, is well below it: at 7 N/mm and 20 ms
         that is 140 N s/m.
     speed : float, default=0.1
-        v: the most by which an offset changes [m/s].
+        The most by which an offset changes, v [m/s].
     depth : float, default=0.02
         The largest offset [m]: how wrong the place of a surface may be.
     release : float, default=0.5
-        T: time constant in which offsets are given up where no contact is expected [s].
+        Time constant T in which offsets are given up where no contact is expected [s].
 
     Raises
     ------

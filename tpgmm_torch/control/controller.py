@@ -209,12 +209,7 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
-        forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
-        self._wrenches = Wrenches(
-            kinematics.links,
-            tuple(start.shape[:-1]),
-            {operator.link: operator.contact for operator in forces},
-        )
+        self._wrenches, forces = _expected_contacts(skill, start, begin)
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
@@ -669,6 +664,14 @@ def _rows(array: Array) -> Array:
 
 def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
+
+
+def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> tuple[Wrenches, bool]:
+    """Readings of wrenches before the first, and whether the skill expects forces."""
+    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+    thresholds = {operator.link: operator.contact for operator in forces}
+    wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), thresholds)
+    return wrenches, bool(forces)
 
 
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:

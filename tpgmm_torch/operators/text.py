@@ -73,9 +73,7 @@ def parse_operator(text: str) -> Operator:
 
 def _term(term: str, text: str) -> list[Operator]:
     if force := FORCE.fullmatch(term):
-        axes = None if force["axes"] is None else tuple(map("xyz".index, force["axes"]))
-        given = {} if force["tolerance"] is None else {"tolerance": float(force["tolerance"])}
-        return [Wrench(force["link"], force["frame"], axes, **given)]
+        return [_force(force)]
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
@@ -102,6 +100,21 @@ def _term(term: str, text: str) -> list[Operator]:
     return {"position": [one], "orientation": [other], "pose": [one, other]}[kind.split("[")[0]]
 
 
+def _force(match: re.Match[str]) -> Wrench:
+    axes = None if match["axes"] is None else tuple(map("xyz".index, match["axes"]))
+    given = {} if match["tolerance"] is None else {"tolerance": float(match["tolerance"])}
+    return Wrench(match["link"], match["frame"], axes, **given)
+
+
+def _joints_text(one: Any) -> str:
+    return "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+
+
+def _force_text(one: Any) -> str:
+    axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
+    return f"wrench{axes}:{one.link}@{one.frame}"
+
+
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
     """All ``links`` seen from all ``frames`` (or from the base) as one stack; the joints."""
     references = [f"@{name}" for name in frames] or [""]
@@ -117,7 +130,7 @@ def format_operator(operator: Operator) -> str:
     ----------
     operator : Operator
         Operators that have no such text, like a user's own, are given by their ``repr``. The
-        gain and the path of orientations are left out.
+        gain and the path of orientations, and the threshold of contact, are left out.
 
     Examples
     --------
@@ -127,17 +140,15 @@ def format_operator(operator: Operator) -> str:
     if isinstance(operator, Stack):
         return " + ".join(map(format_operator, operator.operators))
     one: Any = operator
-    if type(operator) is Canonical:
-        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+    writer = {Canonical: _joints_text, Wrench: _force_text}.get(type(operator))
+    if writer is not None:
+        text = writer(one)
     elif type(operator) in POSE_OPERATORS:
         kind = "position" if one.gain is None else "orientation"
         tangent = "[tangent]" if operator.rotation_vector_starts(None) else ""
         text = f"{kind}{tangent}:{one.link}"
         if hasattr(operator, "frame"):
             text += f"@{'held:' if one.held else ''}{one.frame}"
-    elif type(operator) is Wrench and one.contact == Wrench.contact:
-        axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
-        text = f"wrench{axes}:{one.link}@{one.frame}"
     else:
         return repr(operator)
     return text if one.tolerance == type(one).tolerance else f"{text}~{one.tolerance!r}"

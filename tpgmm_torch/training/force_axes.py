@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.operators import Operator, Wrench
 from tpgmm_torch.training.local_data import Motion
 
@@ -17,6 +18,10 @@ __all__ = ["shares_of_work", "with_force_axes"]
 #: A force does no work along an axis below this share of the work that it could do. Forces
 #: against a surface have shares of 0.00 to 0.02, friction 0.26 to 0.88 (wiping).
 NO_WORK = 0.1
+ALWAYS = (
+    "{0.link!r} is in contact at all instants of all demonstrations: was the tool's weight "
+    "removed from its wrenches? Else Wrench(..., contact=) is below the noise, {0.contact} N"
+)
 
 
 def with_force_axes(
@@ -94,6 +99,8 @@ def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor,
             forces.append(local[touches, :3])
             speeds.append(speed[touches])
     force, speed = (torch.cat(each) for each in (forces, speeds))
+    if len(force) == sum(len(motion.time) for motion in motions):
+        warnings.warn(ALWAYS.format(operator), PlausibilityWarning, stacklevel=2)
     if len(force) < 2:
         raise DataError(
             f"{operator.link!r} is never in contact: its force stays below "

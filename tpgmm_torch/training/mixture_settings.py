@@ -40,6 +40,16 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
     for operator in checked:
         if not isinstance(operator, Operator):
             raise DataError(f"operators holds Operator objects, got {operator!r}")
+    _check_forces(checked)
+    known = [leaf for leaf in leaves(checked) if type(leaf) in COMPARED]
+    for number, leaf in enumerate(known):
+        if leaf in known[:number]:
+            raise DataError(f"operators has {leaf!r} twice: it would count twice")
+    return checked
+
+
+def _check_forces(checked: tuple[Operator, ...]) -> None:
+    """Refuse forces that do not stand behind what says something of the joints."""
     joints = of_joints(checked)
     if (
         not joints
@@ -50,11 +60,6 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
             "Wrench() says nothing of the joints: it stands by itself, in no Stack, behind at "
             f"least one operator that does, got {list(checked)}"
         )
-    known = [leaf for leaf in leaves(checked) if type(leaf) in COMPARED]
-    for number, leaf in enumerate(known):
-        if leaf in known[:number]:
-            raise DataError(f"operators has {leaf!r} twice: it would count twice")
-    return checked
 
 
 def kinematics_for(

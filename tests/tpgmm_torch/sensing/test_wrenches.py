@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.pressing import slides
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.sensing.wrenches import Wrenches, WrenchReading, wrench_of_efforts
@@ -31,17 +30,6 @@ def test_contact_begins_at_the_threshold_and_ends_at_half_of_it_after_a_dwell():
     assert 0.014 <= (begin - 49) * 0.005 <= 0.04
     assert 0.014 <= (end - 199) * 0.005 <= 0.05
     assert not second.any()
-
-
-def test_filter_does_not_depend_on_the_rate():
-    values = []
-    for dt in (0.001, 0.01):
-        reading = WrenchReading.first(1.5, ()).update(forces(0.0), dt)
-        for _ in range(round(0.05 / dt)):
-            reading = reading.update(forces(8.0), dt)
-        values.append(float(reading.value[2]))
-    assert values[0] == pytest.approx(values[1])
-    assert values[0] == pytest.approx(8 * (1 - np.exp(-5)))
 
 
 def test_what_is_not_finite_changes_nothing_but_the_age():
@@ -91,9 +79,3 @@ def test_efforts_of_drives_give_the_force_that_mujoco_applies():
     # three drives tell three numbers: what they do not feel is not in it
     again = state.jacobian("tip").mT @ found
     np.testing.assert_allclose(again, efforts, atol=1e-12)
-    pushed = slides().state([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(
-        wrench_of_efforts(pushed, "hand", torch.from_numpy(force)),
-        [*force, 0, 0, 0],
-        atol=1e-12,
-    )
