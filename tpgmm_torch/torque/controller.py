@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tpgmm_torch.contact import Admittance
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.frames import Frame
@@ -49,8 +50,6 @@ FASTEST_PACE = 2.0
 #: Longest tick, in units of the shortest time constant of the damping: sampled and held,
 #: damping is of no use at 1 and unstable at 2, and contact takes half of the margin.
 LONGEST_TICK = 0.5
-#: Time constant with which integrals of forces fade where there is no contact [s].
-RELEASE_TIME = 0.5
 
 NO_WRENCH = (
     "the skill expects forces, and the first step has no wrench: forces are not corrected by "
@@ -426,7 +425,10 @@ class TorqueController(Controller):
         return replace(found, fused=fused, rate=rate, estimate=estimate, forces=forces)
 
     def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
-        """Integrals of the errors of forces in contact, at most as large as the forces."""
+        """Integrals of the errors of forces in contact, at most as large as the forces.
+
+        Where there is no contact they fade as the offsets of an admittance do.
+        """
         values = {}
         for one, axes in found.forces:
             reading = self._wrenches.readings.get(one.operator.link)
@@ -436,7 +438,7 @@ class TorqueController(Controller):
             error = one.force - (axes @ force).squeeze(-1)
             fresh = torch.as_tensor(reading.age == 0).to(passed.device)
             counts = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
-            left = torch.exp(-(1 - one.share) * dt / RELEASE_TIME).unsqueeze(-1)
+            left = torch.exp(-(1 - one.share) * dt / Admittance.release).unsqueeze(-1)
             value = self._drive.integrals.get(one.operator, torch.zeros_like(error)) * left
             most = one.force.norm(dim=-1, keepdim=True)
             value = value + self._gains.integral * counts * error
