@@ -40,8 +40,8 @@ def mjcf() -> str:
 
 @functools.cache
 def robot() -> Robot:
-    """The arm, with its tip as a link."""
-    return Robot.from_mjcf(mjcf(), links=["tip"])
+    """The arm, with its tip and its elbow as links."""
+    return Robot.from_mjcf(mjcf(), links=["tip", "l3"])
 
 
 @functools.cache

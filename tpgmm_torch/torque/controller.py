@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tpgmm_torch.contact import Admittance
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.frames import Frame
@@ -49,8 +50,6 @@ FASTEST_PACE = 2.0
 #: Longest tick, in units of the shortest time constant of the damping: sampled and held,
 #: damping is of no use at 1 and unstable at 2, and contact takes half of the margin.
 LONGEST_TICK = 0.5
-#: Time constant with which integrals of forces fade where there is no contact [s].
-RELEASE_TIME = 0.5
 
 NO_WRENCH = (
     "the skill expects forces, and the first step has no wrench: forces are not corrected by "
@@ -270,6 +269,18 @@ class TorqueController(Controller):
         if self.command is None and self._bodies and self._gains.integral and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
         speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
+        self._tick, late = None, {**(ages or {}), **self._faults(dt, given, speeds)}
+        command = super().step(dt, joints, frames, holds=holds, ages=late, wrenches=wrenches)
+        known = torch.full_like(speeds, torch.nan)
+        if self._tick is not None and self._tick.joints is not None:
+            known = self._tick.joints
+            if self._gripping is not None:
+                known = torch.where(self._gripping, given, known)
+        self.command = driven = self._driven(command, known, speeds)
+        return driven
+
+    def _faults(self, dt: Any, given: Tensor, speeds: Tensor) -> dict[str, Any]:
+        """Why robots are held, with infinite ages: what is missing, and ticks too long."""
         seconds = dt if isinstance(dt, float | int | Tensor) else 0.0
         late = self._drive.rate * torch.nan_to_num(torch.as_tensor(seconds).to(speeds))
         longest = LONGEST_TICK / float(self._drive.rate.max().clamp_min(1e-9))
@@ -279,22 +290,11 @@ class TorqueController(Controller):
             NO_TORQUE: self._drive.lost,
             LONG_TICK.format(1e3 * longest, 1 / longest): late > LONGEST_TICK,
         }
-        held: dict[str, Any] = {
+        return {
             reason: np.where(robots.numpy(force=True), np.inf, 0.0)
             for reason, robots in faults.items()
             if bool(robots.any())
         }
-        self._tick = None
-        command = super().step(
-            dt, joints, frames, holds=holds, ages={**(ages or {}), **held}, wrenches=wrenches
-        )
-        known = torch.full_like(speeds, torch.nan)
-        if self._tick is not None and self._tick.joints is not None:
-            known = self._tick.joints
-            if self._gripping is not None:
-                known = torch.where(self._gripping, given, known)
-        self.command = driven = self._driven(command, known, speeds)
-        return driven
 
     # Stages that are others where forces are expected: robots are where they are pushed to
 
@@ -425,7 +425,10 @@ class TorqueController(Controller):
         return replace(found, fused=fused, rate=rate, estimate=estimate, forces=forces)
 
     def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
-        """Integrals of the errors of forces in contact, at most as large as the forces."""
+        """Integrals of the errors of forces in contact, at most as large as the forces.
+
+        Where there is no contact they fade as the offsets of an admittance do.
+        """
         values = {}
         for one, axes in found.forces:
             reading = self._wrenches.readings.get(one.operator.link)
@@ -435,7 +438,7 @@ class TorqueController(Controller):
             error = one.force - (axes @ force).squeeze(-1)
             fresh = torch.as_tensor(reading.age == 0).to(passed.device)
             counts = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
-            left = torch.exp(-(1 - one.share) * dt / RELEASE_TIME).unsqueeze(-1)
+            left = torch.exp(-(1 - one.share) * dt / Admittance.release).unsqueeze(-1)
             value = self._drive.integrals.get(one.operator, torch.zeros_like(error)) * left
             most = one.force.norm(dim=-1, keepdim=True)
             value = value + self._gains.integral * counts * error

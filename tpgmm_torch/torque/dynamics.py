@@ -13,9 +13,8 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
-from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
-from tpgmm_torch.robots.urdf import Mimic, description_text, is_text, parse_xml
+from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
 __all__ = ["Dynamics", "MujocoDynamics"]
 
@@ -44,13 +43,13 @@ class Dynamics(Protocol):
 class MujocoDynamics:
     """Dynamics of a robot, computed by MuJoCo.
 
-    Joints that are not in the joint vector stand where the robot has them locked, else where
-    the model begins; those that mimic another one move with it. Friction and damping of the
-    joints are not part of the bias.
+    Joints that are not in the joint vector stand where the robot has them locked; those that
+    mimic another one move with it. Gravity is the model's. Friction and damping of the joints
+    are not part of the bias.
 
     Parameters
     ----------
-    robot : Kinematics
+    robot : Robot
         Its joints are looked up by name.
     model : mujoco.MjModel, path or str, optional
         MJCF or URDF with the masses of the robot, a file or the text itself; by default the
@@ -72,37 +71,53 @@ class MujocoDynamics:
         If a joint is not in the model.
     """
 
-    def __init__(self, robot: Kinematics, model: Any = None) -> None:
+    def __init__(self, robot: Robot, model: Any = None) -> None:
         try:
             import mujoco
         except ImportError as error:
             raise DependencyError(
                 "MujocoDynamics needs MuJoCo: pip install 'tpgmm-torch[simulation]'"
             ) from error
-        self._mujoco = mujoco
-        self._model = model = _compiled(mujoco, robot, model)
-        self._data = mujoco.MjData(model)
-        self._map = _JointMap(mujoco, robot, model)
-        self.effort = torch.from_numpy(_efforts(mujoco, model, self._map.joints)).to(
-            robot.lower
-        )
+        self._mujoco, source = mujoco, robot.model.text if model is None else model
+        self._model = model = _compiled(mujoco, source)
+        self._data, names = mujoco.MjData(model), robot.joint_names
+        known = [model.joint(j).name for j in range(model.njnt)]
+        for name in names:
+            if name not in known:
+                raise UnknownNameError("joint", name, "the model of the dynamics", known)
+        self._map(robot, known)
+        efforts = _efforts(mujoco, model)[[known.index(name) for name in names]]
+        self.effort = torch.from_numpy(efforts).to(robot.lower)
+
+    def _map(self, robot: Robot, known: list[str]) -> None:
+        """Joints of the model as functions of the joint vector."""
+        model, names = self._model, robot.joint_names
+        # what the robot does not know, as objects, stays where it begins
+        moved = [name for name in known if name in robot.model.movable]
+        index, locked = [known.index(name) for name in moved], robot.config()["locked"]
+        self._places, rows = model.jnt_qposadr[index], model.jnt_dofadr[index]
+        self._slopes, self._start = np.zeros((len(moved), len(names))), np.zeros(len(moved))
+        for at, lead in enumerate(map(robot.model.leader, moved)):
+            self._start[at] = lead.offset
+            if lead.joint in names:
+                self._slopes[at, names.index(lead.joint)] = lead.multiplier
+            else:
+                self._start[at] += lead.multiplier * locked.get(lead.joint, 0.0)
+        self._columns = np.zeros((model.nv, len(names)))
+        self._columns[rows] = self._slopes
 
     def __call__(self, joints: Tensor, velocities: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Dynamics.__call__`; robots of a batch one after the other."""
-        n = joints.shape[-1]
         both = torch.broadcast_tensors(joints, velocities)
+        shape, n = both[0].shape, joints.shape[-1]
         rows = [part.numpy(force=True).reshape(-1, n).astype(np.float64) for part in both]
         parts = [self._one(q, qd) for q, qd in zip(*rows, strict=True)]
-        inertia, bias = map(np.stack, zip(*parts, strict=True))
-        batch = both[0].shape[:-1]
-        return (
-            torch.from_numpy(inertia).to(joints).reshape(*batch, n, n),
-            torch.from_numpy(bias).to(joints).reshape(*batch, n),
-        )
+        inertia, bias = (torch.from_numpy(np.stack(x)).to(joints) for x in zip(*parts))  # noqa: B905
+        return inertia.reshape(*shape, n), bias.reshape(shape)
 
     def _one(self, joints: Array, velocities: Array) -> tuple[Array, Array]:
-        mujoco, model, data, columns = self._mujoco, self._model, self._data, self._map.columns
-        data.qpos[self._map.places] = self._map.positions(joints)
+        mujoco, model, data, columns = self._mujoco, self._model, self._data, self._columns
+        data.qpos[self._places] = self._start + self._slopes @ joints
         data.qvel[:] = columns @ velocities
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
@@ -113,22 +128,20 @@ class MujocoDynamics:
         return moved @ columns, outside @ columns
 
 
-def _compiled(mujoco: Any, robot: Kinematics, model: Any) -> Any:
+def _compiled(mujoco: Any, source: Any) -> Any:
     """A model of its own, without contacts."""
-    if model is None:
-        if not isinstance(robot, Robot):
-            raise DataError(
-                f"{type(robot).__name__} has no description with masses: give "
-                "MujocoDynamics(robot, model) an MJCF, a URDF or an MjModel"
-            )
-        model = robot.model.text
     try:
-        if isinstance(model, mujoco.MjModel):
-            model = copy.deepcopy(model)
-        elif is_text(model) or parse_xml(description_text(model)).tag != "mujoco":
-            model = mujoco.MjModel.from_xml_string(_without_shapes(description_text(model)))
-        else:
-            model = mujoco.MjModel.from_xml_path(os.fspath(model))
+        if isinstance(source, mujoco.MjModel):
+            model = copy.deepcopy(source)
+        elif (root := parse_xml(description_text(source))).tag == "mujoco":
+            of_file = not is_text(source)
+            read = mujoco.MjModel.from_xml_path if of_file else mujoco.MjModel.from_xml_string
+            model = read(os.fspath(source) if of_file else description_text(source).strip())
+        else:  # without the meshes that MuJoCo would look for
+            for link in root.iter("link"):
+                for shape in [*link.findall("visual"), *link.findall("collision")]:
+                    link.remove(shape)
+            model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, "unicode"))
     except (ValueError, mujoco.FatalError) as error:
         raise DataError(
             f"MuJoCo cannot compile the model: {error}. A robot that was read from an MJCF "
@@ -138,62 +151,19 @@ def _compiled(mujoco: Any, robot: Kinematics, model: Any) -> Any:
     return model
 
 
-def _without_shapes(text: str) -> str:
-    """A URDF without the meshes that MuJoCo would look for; an MJCF as it is."""
-    root = parse_xml(text)
-    if root.tag == "mujoco":
-        return text.strip()
-    for link in root.iter("link"):
-        for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)
-    return ElementTree.tostring(root, encoding="unicode")
+def _efforts(mujoco: Any, model: Any) -> Array:
+    """Largest torques of joints (njnt,), of their own and of the motors that drive them."""
+    free = np.array([-np.inf, np.inf])
 
+    def largest(limited: Array, ranges: Array) -> Array:
+        found: Array = np.abs(np.where(limited.astype(bool)[:, None], ranges, free)).min(-1)
+        return found
 
-class _JointMap:
-    """Positions and velocities of a model's joints, as functions of the joint vector."""
-
-    def __init__(self, mujoco: Any, robot: Kinematics, model: Any) -> None:
-        names, known = robot.joint_names, [model.joint(j).name for j in range(model.njnt)]
-        locked = robot.config()["locked"] if isinstance(robot, Robot) else {}
-        described = robot.model.movable if isinstance(robot, Robot) else {}
-        for name in names:
-            if name not in known:
-                raise UnknownNameError("joint", name, "the model of the dynamics", known)
-        kinds = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
-        scalar = [j for j in range(model.njnt) if int(model.jnt_type[j]) in kinds]
-        self.joints = [known.index(name) for name in names]
-        self.places, self.rows = model.jnt_qposadr[scalar], model.jnt_dofadr[scalar]
-        self.start = model.qpos0[self.places].copy()
-        self.columns = np.zeros((model.nv, len(names)))
-        for at, j in enumerate(scalar):
-            name = known[j]
-            lead = robot.model.leader(name) if name in described else Mimic(name)  # type: ignore[attr-defined]
-            if lead.joint in names:
-                self.start[at] = lead.offset
-                self.columns[self.rows[at], names.index(lead.joint)] = lead.multiplier
-            elif lead.joint in locked:
-                self.start[at] = lead.offset + lead.multiplier * locked[lead.joint]
-
-    def positions(self, joints: Array) -> Array:
-        """Of the model's joints, at ``places``."""
-        positions: Array = self.start + self.columns[self.rows] @ joints
-        return positions
-
-
-def _efforts(mujoco: Any, model: Any, joints: list[int]) -> Array:
-    """Largest torques of joints, of their own and of the motors that drive them."""
-    limits = np.full(model.njnt, np.inf)
-    limited = model.jnt_actfrclimited.astype(bool)
-    limits[limited] = np.abs(model.jnt_actfrcrange[limited]).min(-1)
-    for motor in np.flatnonzero(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)):
-        joint, gear = model.actuator_trnid[motor, 0], abs(model.actuator_gear[motor, 0])
-        if model.actuator_forcelimited[motor]:
-            most = np.abs(model.actuator_forcerange[motor]).min()
-        elif model.actuator_ctrllimited[motor] and not model.actuator_biasprm[motor].any():
-            most = np.abs(
-                model.actuator_gainprm[motor, 0] * model.actuator_ctrlrange[motor]
-            ).min()
-        else:
-            continue
-        limits[joint] = min(limits[joint], gear * most)
-    return limits[joints]
+    limits = largest(model.jnt_actfrclimited, model.jnt_actfrcrange)
+    forces = largest(model.actuator_forcelimited, model.actuator_forcerange)
+    controls = model.actuator_gainprm[:, :1] * model.actuator_ctrlrange
+    is_motor = ~model.actuator_biasprm.any(-1) & (model.actuator_ctrllimited > 0)
+    forces = np.minimum(forces, largest(is_motor, controls)) * np.abs(model.actuator_gear[:, 0])
+    drives = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    np.minimum.at(limits, model.actuator_trnid[drives, 0], forces[drives])
+    return limits

@@ -225,31 +225,13 @@ class LocalGaussians:
     def __init__(self, skill: Any, gains: TorqueGains) -> None:
         kinematics: Kinematics = skill.kinematics
         operators = of_joints(skill.operators)
-        members = leaves(operators)
-        for leaf in members:
-            if not isinstance(leaf, Canonical | PoseOperator):
-                raise DataError(
-                    f"{leaf!r} has no rows in torque space: there are those of Canonical, of "
-                    "positions and orientations, their stacks, and Wrench"
-                )
         with torch.inference_mode(False):
             self.conditionals = Conditionals.stacked(skill.fused)
         self.skill, self.marginals, self.stack = skill, skill.marginals, Stack(*operators)
         self._starts = self.stack.quaternion_starts(kinematics)
         self._kinematics = kinematics
         #: What the rows of :class:`Mechanics` are of: which of the six are asked for.
-        self.bodies: dict[Body, tuple[bool, bool]] = {}
-        poses = [
-            (_body(x, kinematics), x.gain is None)
-            for x in members
-            if isinstance(x, PoseOperator)
-        ]
-        forces = [
-            ((x.link, None, False), True) for x in skill.operators if isinstance(x, Wrench)
-        ]
-        for body, is_place in [*forces, *poses]:
-            place, turn = self.bodies.get(body, (False, False))
-            self.bodies[body] = place or is_place, turn or not is_place
+        self.bodies = _bodies(skill)
         index: list[int] = []
         self._tangents: list[tuple[int, Any]] = []
         labels, noise = [], []  # operator, leaf and three coordinates that rows belong to
@@ -484,6 +466,27 @@ def fused_torque(rows: Sequence[TorqueRows], mechanics: Mechanics) -> tuple[Tens
         precision, vector = precision + more, vector + towards
     factor = gaussians.cholesky(precision, "the precision of the torques")
     return torch.cholesky_solve(vector, factor).squeeze(-1), torch.cholesky_inverse(factor)
+
+
+def _bodies(skill: Any) -> dict[Body, tuple[bool, bool]]:
+    """What the operators of a skill ask for: positions and turns of each body."""
+    bodies: dict[Body, tuple[bool, bool]] = {}
+    for leaf in leaves(skill.operators):
+        turns = isinstance(leaf, PoseOperator) and leaf.gain is not None
+        if isinstance(leaf, PoseOperator):
+            body = _body(leaf, skill.kinematics)
+        elif isinstance(leaf, Wrench):
+            body = leaf.link, None, False
+        elif isinstance(leaf, Canonical):
+            continue
+        else:
+            raise DataError(
+                f"{leaf!r} has no rows in torque space: there are those of Canonical, of "
+                "positions and orientations, their stacks, and Wrench"
+            )
+        place, turn = bodies.get(body, (False, False))
+        bodies[body] = place or not turns, turn or turns
+    return bodies
 
 
 def _body(leaf: PoseOperator, kinematics: Kinematics) -> Body:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.own_operators import PlanarPosition
 from tests.support.torque_arm import (
     BOARD,
     POSE,
@@ -88,6 +89,8 @@ def test_the_inverse_is_the_dynamically_consistent_one_of_mujoco():
         (AbsoluteOrientation("tip"), lambda r: 120 * (1 - np.sqrt(1 - r @ r / 4))),
         (RelativeOrientation("tip", "board"), lambda r: 120 * (1 - np.sqrt(1 - r @ r / 4))),
         (RelativeOrientation("tip", "board", geometry="tangent"), lambda r: 15 * r @ r),
+        (RelativePosition("tip", "l3"), lambda r: 450 * r @ r),
+        (RelativeOrientation("tip", "l3"), lambda r: 120 * (1 - np.sqrt(1 - r @ r / 4))),
     ],
     ids=str,
 )
@@ -184,13 +187,4 @@ def test_a_share_of_contact_weakens_the_force():
 
 def test_operators_of_other_kinds_are_refused():
     with pytest.raises(DataError, match="no rows in torque space"):
-        LocalGaussians(skill([_Custom()], POSTURE), TorqueGains())
-
-
-class _Custom(Wrench):
-    """Rows in joint space that torque space does not know."""
-
-    constrains_joints = True
-
-    def __init__(self):
-        super().__init__("tip", "board", (2,))
+        LocalGaussians(skill([Canonical(), PlanarPosition()], POSTURE), TorqueGains())
