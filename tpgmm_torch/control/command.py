@@ -217,6 +217,7 @@ def statuses(
     held: Sequence[tuple[Flags | None, str]],
     halted: Flags | None,
     inputs: Inputs | None,
+    obstructed: Mapping[int, tuple[bool, str]] = MappingProxyType({}),
 ) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
     """The status of each robot, and why one does not simply run.
 
@@ -237,6 +238,8 @@ def statuses(
         Robots without accepted inputs.
     inputs : Inputs, optional
         Why that is so.
+    obstructed : mapping of int to (bool, str)
+        Robots that obstacles keep off: whether time waits for them, and why.
     """
     codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
     if progress.waits.any():
@@ -245,6 +248,10 @@ def statuses(
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
     if ended is not None:
         codes[ended] = Status.FINISHED.code
+    for row, (waits, reason) in obstructed.items():
+        texts[row] = reason
+        if waits:
+            codes[row] = Status.WAITING.code
     for robots, reason in held:
         if robots is not None:
             codes[robots] = Status.HOLDING.code

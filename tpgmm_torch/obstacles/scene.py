@@ -69,7 +69,7 @@ class Scene:
     allowed : mapping of (str, str) to str
         Pairs that do not count, in alphabetical order, and why.
     closer : mapping of (str, str) to float
-        Pairs of which a smaller distance counts, as demonstrations come so near [m].
+        Pairs that only must not overlap, and how near demonstrations bring them [m].
 
     Raises
     ------
@@ -139,6 +139,12 @@ class Scene:
     def pairs(self) -> tuple[Pair, ...]:
         """Names of the pairs of solids that count, (P,)."""
         return self._pairs
+
+    def label(self, pair: int) -> str:
+        """The names of a pair in words: "l_forearm / table"."""
+        return " / ".join(
+            sorted(self._pairs[pair], key=lambda n: n not in self.robot.model.links)
+        )
 
     @property
     def needed(self) -> Array:
@@ -221,7 +227,8 @@ class Scene:
     ) -> Self:
         """The scene with pairs allowed that come near each other in demonstrations.
 
-        Pairs that overlap there do not count any more; others may come as near as they did.
+        Pairs that overlap there do not count any more; those that come nearer than the
+        clearance only must not overlap.
 
         Parameters
         ----------
@@ -268,7 +275,7 @@ class Scene:
         self.geometry.select(self.geometry.pairs[np.array(keep, bool)])
         self._pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
         self._needed = np.array(
-            [min(self.clearance, self.closer.get(pair, np.inf)) for pair in self._pairs]
+            [0.0 if pair in self.closer else self.clearance for pair in self._pairs]
         )
 
     def _always(self) -> dict[Pair, str]:
