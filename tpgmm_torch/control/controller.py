@@ -16,6 +16,8 @@ reach
     the posture that is wanted (:mod:`~tpgmm_torch.control.reach`)
 follow
     the next reference, within bounds (:mod:`~tpgmm_torch.motion.follow`)
+avoid
+    references that keep clear of obstacles (:mod:`~tpgmm_torch.obstacles.avoid`)
 command
     what is sent, and the status in words (:mod:`~tpgmm_torch.control.command`)
 
@@ -155,6 +157,10 @@ class Controller:
         Run a part of the skill [s].
     at_rest : bool
         Whether robots stand when the skill begins; else they move as the skill does.
+    obstacles : Scene, optional
+        What references keep clear of (:class:`~tpgmm_torch.obstacles.Scene`). Time waits for
+        robots that are kept too far off, and before something is taken or put; not with the
+        clock ``"even"``. The command's reason says what is in the way.
 
     Attributes
     ----------

@@ -5,13 +5,14 @@ is sent as it is. Elsewhere a robot is *led*: one convex problem decides where e
 come to rest if it braked after this tick, and so where it is then
 (:mod:`~tpgmm_torch.motion.braking`). The ways x to rest
 
-    minimise  sum over hands of |J_p x - e_p|^2 / P^2 + |J_o x - e_o|^2 / O^2 + |x - e|^2 / Q^2
+    minimise  sum over hands of |J_p x - e_p|^2 / P^2 + |J_o x - e_o|^2 / O^2
+              + |x - e|^2 / Q^2 + |x - r|^2 / C^2
     such that n^T J x >= -(d - d_min) / 2,   n^T J x' >= -(d - d_min)   and   r_0 <= x <= r_1,
 
-where e are the ways to where the ordinary reference would come to rest, x' is the way of this
-tick, which x decides, and distances d and their derivatives n^T J are those at the last
-reference. Half of the room is for braking, as nearest points jump from edge to edge. Rows give
-way, as little as can be, only where nothing else is possible.
+where e are the ways to where the ordinary reference would come to rest, r is its own way to
+there, x' is the way of this tick, which x decides, and distances d and their derivatives n^T J
+are those at the last reference. Half of the room is for braking, as nearest points jump from
+edge to edge. Rows give way, as little as can be, only where nothing else is possible.
 
 The skill knows nothing of it: the ordinary reference goes on beside the one that is sent, and a
 led robot joins it as soon as the bounds of motion let it. Nothing plans: a robot that cannot go
@@ -42,8 +43,9 @@ from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["Avoidance"]
 
-#: How exactly hands are led [m, rad], and joints, which are free to give way [rad or m].
-HAND, TURN, JOINT = 0.005, 0.05, 0.5
+#: How exactly hands are led [m, rad], and joints, which are free to give way, and whose ways
+#: to rest are rather as long as ordinary ones: nothing trembles beside an edge [rad or m].
+HAND, TURN, JOINT, CALM = 0.005, 0.05, 0.5, 0.05
 #: Share of the room to an obstacle that is used up before a robot could stand still.
 SHARE = 0.5
 #: Speed at which a robot leaves what it is too near to [m/s].
@@ -263,12 +265,8 @@ class _Tick:
         """How much distances have to grow (2, N): until the next tick, and until rest."""
         room = near.distance - self.scene.needed[near.pair]
         dt = np.broadcast_to(np.ravel(self.ordinary.moment.dt), len(self.here))[near.robot]
-        return np.stack(
-            (
-                -np.maximum(room, 0.0),
-                np.maximum(-SHARE * room, np.minimum(-room, LEAVING * dt)),
-            )
-        )
+        leaving = np.minimum(-room, LEAVING * dt)
+        return np.stack((-np.maximum(room, 0.0), np.where(room < 0, leaving, -SHARE * room)))
 
     def solved(self, robots: Mask, pairs: list[str]) -> Array:
         """Motions (3, N, n_joints) of N robots; what is in their way goes into the pairs."""
@@ -280,23 +278,21 @@ class _Tick:
         slope = np.where(wide > 0, (second - first) / np.where(wide > 0, wide, 1.0), 0.0)
         reach = np.maximum(np.abs(low), np.abs(high))
         near, rows = self.near(np.where(robots[:, None], reach, -1.0))
-        least, goal = self.least(near), self.ordinary.moment.motion[0].reshape(shape)
-        # half of the gap is closed, and the rest of the way is that of the ordinary reference
-        onwards = rest(self.ordinary).reshape(shape) - goal
-        ends = torch.from_numpy(here), torch.from_numpy(here + SHARE * (goal - here) + onwards)
-        chosen = here.copy()
+        least, goal = self.least(near), rest(self.ordinary).reshape(shape)
+        onwards = goal - self.ordinary.moment.motion[0].reshape(shape)
+        ends, chosen = (torch.from_numpy(here), torch.from_numpy(goal)), here.copy()
         for row, (jacobian, error) in zip(
             np.flatnonzero(robots).tolist(), self.hands(*ends, robots), strict=True
         ):
             own = near.robot == row
-            most = np.maximum(rows * low[row], rows * high[row])
-            most = np.minimum(rows * low[row], rows * high[row]).sum(1)
-            own &= most < np.maximum(least[1], 1e-3)
+            own &= np.minimum(rows * low[row], rows * high[row]).sum(1) < least.max(0)
             # the way of this tick is linear in the way to rest
             start = rows[own] @ (first[row] - slope[row] * low[row])
             way, weights = _nearest(
-                jacobian.T @ jacobian + np.eye(shape[1]) / JOINT**2,
-                jacobian.T @ error + (ends[1][row].numpy() - here[row]) / JOINT**2,
+                jacobian.T @ jacobian + np.eye(shape[1]) * (1 / JOINT**2 + 1 / CALM**2),
+                jacobian.T @ error
+                + (goal[row] - here[row]) / JOINT**2
+                + onwards[row] / CALM**2,
                 np.concatenate((rows[own] * slope[row], rows[own])),
                 np.concatenate((least[0, own] - start, least[1, own])),
                 (low[row], high[row]),

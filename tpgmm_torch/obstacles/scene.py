@@ -69,7 +69,7 @@ class Scene:
     allowed : mapping of (str, str) to str
         Pairs that do not count, in alphabetical order, and why.
     closer : mapping of (str, str) to float
-        Pairs that only must not overlap, and how near demonstrations bring them [m].
+        Pairs that may come half as near as demonstrations bring them, which is this [m].
 
     Raises
     ------
@@ -228,7 +228,7 @@ class Scene:
         """The scene with pairs allowed that come near each other in demonstrations.
 
         Pairs that overlap there do not count any more; those that come nearer than the
-        clearance only must not overlap.
+        clearance may come half as near as they did.
 
         Parameters
         ----------
@@ -275,7 +275,7 @@ class Scene:
         self.geometry.select(self.geometry.pairs[np.array(keep, bool)])
         self._pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
         self._needed = np.array(
-            [0.0 if pair in self.closer else self.clearance for pair in self._pairs]
+            [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self._pairs]
         )
 
     def _always(self) -> dict[Pair, str]:
