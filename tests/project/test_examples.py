@@ -161,6 +161,10 @@ CLAIMS = {
             and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
         ),
     ),
+    "plot_19_obstacles.py": (
+        1,
+        lambda v: v["distances"]["alone"].min() < -20 and v["distances"]["around"].min() > 5,
+    ),
 }
 
 
