@@ -47,6 +47,7 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     TPGMMError,
 )
+from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
@@ -520,7 +521,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         frames = self.frames.frames(batch)
         if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
-        return Controller(self.skill, joints, frames, **self.config.control.options())
+        options = self.config.control.options()
+        if self.config.obstacles is not None:
+            path, _, visuals = self.config.obstacles.partition(":")
+            options["obstacles"] = Scene(self.kinematics, path, visuals=visuals == "visuals")
+        return Controller(self.skill, joints, frames, **options)
 
     def _measurements(
         self, batch: Mapping[str, Tensor], controller: Controller

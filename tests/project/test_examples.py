@@ -179,6 +179,10 @@ CLAIMS = {
             and v["pressed"]["positions alone", 5] > 15
         ),
     ),
+    "plot_20_obstacles.py": (
+        1,
+        lambda v: v["distances"]["alone"].min() < -20 and v["distances"]["around"].min() > 5,
+    ),
 }
 
 

@@ -28,7 +28,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("robots", "alignment", "mixture"),
         ("operators", "impedance"),
         ("checks", "metrics", "motion", "sensing"),
-        ("training",),
+        ("obstacles", "training"),
         ("regression",),
         ("contact", "events", "skills"),
         ("control",),

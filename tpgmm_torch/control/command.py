@@ -219,6 +219,7 @@ def statuses(
     halted: Flags | None,
     inputs: Inputs | None,
     gates: Gates | None = None,
+    obstructed: Mapping[int, tuple[bool, str]] = MappingProxyType({}),
 ) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
     """The status of each robot, and why one does not simply run.
 
@@ -241,6 +242,8 @@ def statuses(
         Why that is so.
     gates : Gates, optional
         What robots wait for at the end of a skill.
+    obstructed : mapping of int to (bool, str)
+        Robots that obstacles keep off: whether time waits for them, and why.
     """
     codes, texts = _at_gates(progress, gates)
     if progress.waits.any():
@@ -249,6 +252,10 @@ def statuses(
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
     if ended is not None:
         codes[ended] = Status.FINISHED.code
+    for row, (waits, reason) in obstructed.items():
+        texts[row] = reason
+        if waits:
+            codes[row] = Status.WAITING.code
     for robots, reason in held:
         if robots is not None:
             codes[robots] = Status.HOLDING.code

@@ -21,6 +21,8 @@ reach
     the posture that is wanted (:mod:`~tpgmm_torch.control.reach`)
 follow
     the next reference, within bounds (:mod:`~tpgmm_torch.motion.follow`)
+avoid
+    references that keep clear of obstacles (:mod:`~tpgmm_torch.obstacles.avoid`)
 command
     what is sent, and the status in words (:mod:`~tpgmm_torch.control.command`)
 
@@ -59,7 +61,7 @@ from tpgmm_torch.control.estimate import choose, estimate
 from tpgmm_torch.control.gates import Gates, Moment
 from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
+from tpgmm_torch.control.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
 from tpgmm_torch.data.arrays import Array, as_array
@@ -69,6 +71,8 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follow import Following
 from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.obstacles.avoid import Avoidance
+from tpgmm_torch.obstacles.scene import Scene
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
@@ -105,6 +109,8 @@ class _Tick:
         Accepted readings, NaN elsewhere.
     halted : bool array of shape (B,), optional
         Robots without accepted inputs.
+    obstructed : array of shape (B,), optional
+        How much obstacles hold robots up; from 1 on time stands.
     ended : Tensor of bool of shape (...), optional
         Robots that have been at the end of the skill for a tick.
     """
@@ -115,6 +121,7 @@ class _Tick:
     time: Tensor = field(init=False)
     joints: Tensor | None = None
     halted: Flags | None = None
+    obstructed: Array | None = None
     ended: Tensor | None = None
 
 
@@ -162,6 +169,10 @@ class Controller:
         Run a part of the skill [s].
     at_rest : bool
         Whether robots stand when the skill begins; else they move as the skill does.
+    obstacles : Scene, optional
+        What references keep clear of (:class:`~tpgmm_torch.obstacles.Scene`). Time waits for
+        robots that are kept too far off, and before something is taken or put; not with the
+        clock ``"even"``. The command's reason says what is in the way.
 
     Attributes
     ----------
@@ -192,6 +203,7 @@ class Controller:
         begin: float | None = None,
         end: float | None = None,
         at_rest: bool = True,
+        obstacles: Scene | None = None,
     ) -> None:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
@@ -219,6 +231,10 @@ class Controller:
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
+        self._avoidance = None
+        if obstacles is not None:
+            batch = len(self._progress.time)
+            self._avoidance = Avoidance.start(obstacles, kinematics, bounds, batch)
         self._limits = None
         if bounds is not None:  # rounded postures stay within these
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
@@ -243,7 +259,13 @@ class Controller:
     @property
     def reference(self) -> Tensor:
         """The last reference (..., n_joints); the start posture before the first step."""
-        return self._following.reference
+        return self._sent.reference
+
+    @property
+    def _sent(self) -> Following | Follower:
+        """What is sent: the ordinary references, or those that keep clear of obstacles."""
+        sent = None if self._avoidance is None else self._avoidance.sent
+        return self._following if sent is None else sent
 
     @property
     def holding(self) -> Holding:
@@ -443,8 +465,9 @@ class Controller:
         passed = none + np.ravel(tick.seconds)
         held = [robots for robots in (tick.halted, tick.late) if robots is not None]
         still: Flags = np.logical_or.reduce([none, *held])
+        tick.obstructed = self._obstruction(passed)
         if not self._trusts and tick.joints is None:
-            self._progress = before.even(np.where(still, 0.0, passed))
+            self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
         else:
             reference = _rows(as_array(self.reference))
             known, jumped = tick.joints, none
@@ -452,11 +475,21 @@ class Controller:
             if self._inputs is not None:
                 jumped = self._inputs.jumped.reshape(-1)
                 still = still | self._inputs.jumping.reshape(-1)
-            seen = Seen(passed, readings, jumped, still)
+            seen = Seen(passed, readings, jumped, still, tick.obstructed)
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
         tick.ended = self._tensor(over) if over.any() else None
+
+    def _obstruction(self, passed: Array) -> Array | None:
+        """How much obstacles hold robots up (B,)."""
+        if self._avoidance is None or not self._avoidance.led.any():
+            return None
+        progress = self._progress
+        stops = {*progress.clock.arrivals, progress.end}
+        stops.update(time for hold in self._skill.holds for time in (hold.begin, hold.end))
+        soon = progress.time + CATCH_UP * progress.clock.speed * passed
+        return self._avoidance.obstruction(progress.time, soon, sorted(stops))
 
     def _resume(self, robots: Flags) -> None:
         """Robots go on from where they are: those given, and those at another time."""
@@ -548,7 +581,7 @@ class Controller:
         """The posture that is wanted, and the follower there, where all robots can follow."""
         seconds = 0.0 if tick.first else _each(tick.seconds)
         shift, self._fade = self._fade.advance(
-            self.reference, found.joints, seconds, tick.first
+            self._following.reference, found.joints, seconds, tick.first
         )
         wanted, fitting = self._rounded(found.joints, shift), None
         if not tick.first:
@@ -594,24 +627,36 @@ class Controller:
             None if robots is None else self._tensor(robots)
             for robots in (None if tick.first else tick.halted, tick.late)
         )
+        before = self._following.follower
         self._following = self._following.advance(
             wanted, goal, tick.seconds, halted, late, tick.first, fitting
         )
+        if self._avoidance is not None and before is not None and not tick.first:
+            none: Flags = np.zeros(len(progress.time), bool)
+            state = self._state(self.reference) if self.holding.carries else None
+            self._avoidance = self._avoidance.advance(
+                before, self._following.follower, state, self.holding.frames,
+                none if tick.halted is None else tick.halted,
+                none if tick.late is None else tick.late,
+            )  # fmt: skip
 
     def _send(self, tick: _Tick) -> Command:
         """The command, with the status of each robot."""
         following, progress = self._following, self._progress
         lost = None if following.lost is None else following.lost.numpy(force=True).reshape(-1)
         ended = None if tick.ended is None else tick.ended.numpy(force=True).reshape(-1)
+        blocked: Mapping[int, tuple[bool, str]] = {}
+        if tick.obstructed is not None and self._avoidance is not None:
+            blocked = self._avoidance.reasons(tick.obstructed)
         codes, reasons = commands.statuses(
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
             ((lost, NO_ANSWER), (tick.late, NOT_INCREASED)),
-            tick.halted, self._inputs, self._gates,
+            tick.halted, self._inputs, self._gates, blocked,
         )  # fmt: skip
         self.command = Command(
-            following.reference,
-            following.velocity,
+            self._sent.reference,
+            self._sent.velocity,
             tick.time,
             self._found,
             self._tensor(codes),
@@ -646,7 +691,7 @@ class Controller:
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
         if not measured or tick.joints is None:
-            return self.reference
+            return self._following.reference
         return torch.where(tick.joints.isnan(), self.reference, tick.joints)
 
     @property

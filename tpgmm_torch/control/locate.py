@@ -76,12 +76,15 @@ class Seen:
         Robots whose readings have jumped to somewhere else, and stay there.
     halted : bool array of shape (B,)
         Robots for which time stands: nothing can be trusted, or time did not increase.
+    obstructed : array of shape (B,), optional
+        How much obstacles hold robots up: time goes on the slower, and from 1 on stands.
     """
 
     dt: Array
     joints: Array
     jumped: Flags
     halted: Flags
+    obstructed: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,8 +209,10 @@ class Progress:
         new = new._compared(seen)._noticed(reference, seen, find)
         return new._probed(reference, seen, find)._released(seen)
 
-    def even(self, dt: float | Array) -> Self:
+    def even(self, dt: float | Array, obstructed: Array | None = None) -> Self:
         """Progress where nothing is measured."""
+        if obstructed is not None and self.clock.kind != "even":
+            dt = dt * np.clip(2 - 2 * obstructed, 0.0, 1.0)
         return changed(self, time=self._until_end(self.clock.speed * dt))
 
     def arrived(self, reference: Array, velocity: Array, readings: Array) -> Flags:
@@ -270,6 +275,8 @@ class Progress:
         stands = seen.halted | (self.mode != RUNNING)
         waits = self.clock.kind != "even"
         lead = np.where(known, self.servo.lead, 0.0).max(-1)
+        if seen.obstructed is not None:
+            lead = np.maximum(lead, seen.obstructed)
         rate = np.minimum(np.maximum(2 - waits * 2 * np.maximum(excess, lead), 0.0), 1.0)
         if waits:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
