@@ -545,8 +545,8 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
         ``pose-noise``, ``biased``, ``sagging``, ``pose-lost``, ``pose-stale``,
         ``irregular-ticks``, ``lower``, ``higher``, ``tilted``, ``slips``, ``knocked``. A number
-        behind a name says how many seconds, ``stopped-3``, and one behind ``@`` when it happens,
-        if that is not to be drawn: ``pushed-back-1.5@6``.
+        behind a name says how many seconds, ``stopped-3``, and one behind ``@`` when it
+        happens, if that is not to be drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------

@@ -240,9 +240,9 @@ def _recording_summary(
         str(replace(one, begin=round(one.begin, 2), end=round(one.end, 2)))
         for one in kept[0].holds or ()
     ]
-    lines["held"] = ", ".join(holds)
-    if holds and default and len(kept[0].frames) > 1:
-        lines["held"] += " (--operator auto, if it counts where that is put)"
+    hint = " (--operator auto, if it counts where that is put)"
+    counts = bool(holds) and default and len(kept[0].frames) > 1
+    lines["held"] = ", ".join(holds) + hint * counts
     return {name: text or "none" for name, text in lines.items()}
 
 
