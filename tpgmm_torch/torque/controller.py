@@ -197,6 +197,8 @@ class TorqueController(Controller):
         effort: Any = None,
         **settings: Any,
     ) -> None:
+        if settings.get("obstacles") is not None:
+            raise DataError("torques do not keep clear of obstacles: Controller does")
         super().__init__(skill, joints, frames, **{"admittance": None} | settings)
         if self._inputs is None:
             raise DataError("trust=None follows every reading: torques need trust=Trust(...)")
