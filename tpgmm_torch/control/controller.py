@@ -542,7 +542,7 @@ class Controller:
         unseen |= self._inputs.lost
         return Moment(
             self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
-            self.holding, getattr(self, "contacts", {}), arrived,
+            self.holding, self.contacts, arrived,
         )  # fmt: skip
 
     def _hold(self, tick: _Tick, frames: Any, holds: Any) -> None:
