@@ -33,9 +33,8 @@ class TorqueGains:
         Of each mode of inertia and stiffness; 1 is critical.
     frame_tolerance, frame_turn_tolerance : float
         Standard deviation of the pose of frames that positions [m] and orientations [rad] are
-        relative to. It decides the force: where a position that agrees to a tenth of a
-        millimetre is told to be inside a board, forces have to win by what is not known of
-        the board.
+        relative to. It decides the force: against a position that is known to a tenth of
+        a millimetre, and is inside of a board, no force would win.
     contact_stiffness : float
         Of tool and surface in series [N/m]; the damping along axes of forces is
         ``2 zeta sqrt(k m)`` with the mass that the link has along them.
