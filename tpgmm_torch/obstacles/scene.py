@@ -327,17 +327,16 @@ def _own(
 def _moving_pairs(robot: Robot, shapes: Sequence[Shape]) -> Any:
     """Pairs of solids (P, 2) whose parts move, and are not connected by one joint."""
     above = {joint.child: joint.parent for joint in robot.model.joints}
-    base = _part(robot, robot.config()["base"])
+    base, model = robot.config()["base"], robot.model
     links = [one.carrier in robot.model.links for one in shapes]
     parts = [
-        _part(robot, str(one.carrier)) if is_link else one.carrier or base
-        for one, is_link in zip(shapes, links, strict=True)
+        _part(robot, one.carrier or base)
+        if one.carrier in (None, *model.links)
+        else one.carrier
+        for one in shapes
     ]
     # the part from which the joint of a part hangs
-    nearer = [
-        _part(robot, above[part]) if is_link and part in above else None
-        for part, is_link in zip(parts, links, strict=True)
-    ]
+    nearer = [_part(robot, above[part]) if part in above else None for part in parts]
     codes = {name: at for at, name in enumerate(dict.fromkeys((None, *parts, *nearer)))}
     own, near = (np.array([codes[x] for x in names]) for names in (parts, nearer))
     first, second = np.triu_indices(len(shapes), 1)
