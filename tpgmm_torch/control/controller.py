@@ -631,11 +631,17 @@ class Controller:
         self._following = self._following.advance(
             wanted, goal, tick.seconds, halted, late, tick.first, fitting
         )
-        if self._avoidance is not None and before is not None and not tick.first:
-            none: Flags = np.zeros(len(progress.time), bool)
+        if before is not None and not tick.first:
+            self._avoid(tick, before)
+
+    def _avoid(self, tick: _Tick, before: Follower) -> None:
+        """The references that are sent, clear of obstacles."""
+        after = self._following.follower
+        if self._avoidance is not None and after is not None:
+            none: Flags = np.zeros(len(self._progress.time), bool)
             state = self._state(self.reference) if self.holding.carries else None
             self._avoidance = self._avoidance.advance(
-                before, self._following.follower, state, self.holding.frames,
+                before, after, state, self.holding.frames,
                 none if tick.halted is None else tick.halted,
                 none if tick.late is None else tick.late,
             )  # fmt: skip

@@ -186,10 +186,7 @@ class Avoidance:
             motion = after.moment.motion.copy()
             motion.reshape(3, *tick.here.shape)[:, bad] = tick.solved(bad, pairs)
             after = after.redirected(before, motion, bad.reshape(shape[:-1]))
-        for robots, instead in ((halted & self.led, None), (late, before)):
-            if robots.any():
-                where = torch.from_numpy(robots.reshape(shape[:-1]))
-                after = after.undone(where, instead or before.braked(after))
+        after = _still(after, before, halted & self.led, late)
         apart = (after.moment.motion != ordinary.moment.motion).any(0).any(-1).reshape(-1)
         led = (self.led | bad) & apart
         lead = np.zeros(len(led))
@@ -210,6 +207,15 @@ class Avoidance:
         joins = before.moment.allows(exact, before.bounds).all(-1).reshape(-1)
         moment = exact.choose(where[..., None], ordinary.moment)
         return replace(ordinary, moment=moment), joins
+
+
+def _still(after: Follower, before: Follower, halted: Mask, late: Mask) -> Follower:
+    """The follower after a tick, in which some robots brake, and others are as they were."""
+    for robots, instead in ((halted, None), (late, before)):
+        if robots.any():
+            where = torch.from_numpy(robots.reshape(after.reference.shape[:-1]))
+            after = after.undone(where, instead or before.braked(after))
+    return after
 
 
 @dataclass(frozen=True, eq=False)

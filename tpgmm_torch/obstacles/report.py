@@ -62,7 +62,7 @@ def find_contacts(
     ----------
     scene : Scene
     time : array-like of shape (T,)
-        [s]
+        In seconds.
     joints : array-like of shape (T, n_joints)
         References, or a recording [rad or m].
     frames : mapping of str to Frame, optional

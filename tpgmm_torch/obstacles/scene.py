@@ -120,11 +120,7 @@ class Scene:
         if geometry is not None or not own:
             own = _own(robot, geometry, None if meshes is None else Path(meshes), visuals)
         self.shapes = (*own, *(one for one in obstacles if one.carrier not in links))
-        for pair in allowed:
-            for name in pair:
-                if name not in self.names:
-                    raise UnknownNameError("solid", name, "the scene", self.names)
-            why[_pair(pair)] = "given"
+        why |= {self._known(pair): "given" for pair in allowed}
         self.allowed: Mapping[Pair, str] = MappingProxyType(why)
         pairs = _moving_pairs(robot, self.shapes)
         self.geometry = Geometry(robot, self.shapes, pairs)
@@ -265,6 +261,13 @@ class Scene:
         other._allow({p: text.format(-1e3 * d) for p, d in least.items() if d <= 0})
         return other
 
+    def _known(self, names: Sequence[str]) -> Pair:
+        """A pair of solids that exist."""
+        for name in (pair := _pair(names)):
+            if name not in self.names:
+                raise UnknownNameError("solid", name, "the scene", self.names)
+        return pair
+
     def _allow(self, more: Mapping[Pair, str]) -> None:
         """Leave out pairs."""
         self.allowed = MappingProxyType({**more, **self.allowed})
@@ -323,32 +326,33 @@ def _own(
 
 def _moving_pairs(robot: Robot, shapes: Sequence[Shape]) -> Any:
     """Pairs of solids (P, 2) whose parts move, and are not connected by one joint."""
-    model, config = robot.model, robot.config()
-    above = {joint.child: joint for joint in model.joints}
-    driven = set(config["joints"]).difference(config["coordinates"])
-
-    def part(link: str) -> str:
-        """The uppermost link that is rigidly connected."""
-        while (joint := above.get(link)) is not None:
-            if joint.movable and model.leader(joint.name).joint in driven:
-                break
-            link = joint.parent
-        return link
-
-    def near(one: str, other: str) -> bool:
-        return one in above and part(above[one].parent) == other
-
-    base = part(config["base"])
+    above = {joint.child: joint.parent for joint in robot.model.joints}
+    base, model = robot.config()["base"], robot.model
+    links = [one.carrier in robot.model.links for one in shapes]
     parts = [
-        one.carrier if one.carrier not in {None, *model.links} else part(one.carrier or base)
+        _part(robot, one.carrier or base)
+        if one.carrier in (None, *model.links)
+        else one.carrier
         for one in shapes
     ]
-    links = [one.carrier in model.links for one in shapes]
-    pairs = []
-    for i, one in enumerate(parts):
-        for j, other in enumerate(parts[:i]):
-            both = links[i] and links[j]
-            connected = both and (near(str(one), str(other)) or near(str(other), str(one)))
-            if one != other and not connected:
-                pairs.append((j, i))
-    return np.array(pairs, np.intp).reshape(-1, 2)
+    # the part from which the joint of a part hangs
+    nearer = [_part(robot, above[part]) if part in above else None for part in parts]
+    codes = {name: at for at, name in enumerate(dict.fromkeys((None, *parts, *nearer)))}
+    own, near = (np.array([codes[x] for x in names]) for names in (parts, nearer))
+    first, second = np.triu_indices(len(shapes), 1)
+    both = np.array(links)[first] & np.array(links)[second]
+    connected = both & ((near[first] == own[second]) | (near[second] == own[first]))
+    keep = (own[first] != own[second]) & ~connected
+    return np.stack((first[keep], second[keep]), axis=1)
+
+
+def _part(robot: Robot, link: str) -> str:
+    """The uppermost link that is rigidly connected."""
+    model, config = robot.model, robot.config()
+    driven = set(config["joints"]).difference(config["coordinates"])
+    above = {joint.child: joint for joint in model.joints}
+    while (joint := above.get(link)) is not None:
+        if joint.movable and model.leader(joint.name).joint in driven:
+            break
+        link = joint.parent
+    return link

@@ -199,23 +199,34 @@ def solids(model: Any, links: Sequence[str], base: str, visuals: bool) -> Iterat
     at = names.index(base) if base in names else 0
     origin = Frame(data.xpos[at].copy(), data.xquat[at].copy())
     for index in range(model.ngeom):
-        geom, body = model.geom(index), int(model.geom_bodyid[index])
-        if not (visuals or model.geom_contype[index] or model.geom_conaffinity[index]):
-            continue
-        root = int(model.body_rootid[body])
-        kind = mujoco.mjtGeom(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
-        pose = Frame(geom.pos.copy(), geom.quat.copy())
-        carrier = names[body] if names[body] in links else None
-        name, rest = carrier or names[body] if body else geom.name or f"geom{index}", None
-        if carrier is None:
-            world = Frame(data.xpos[body].copy(), data.xquat[body].copy()).compose(pose)
-            pose, free = world.seen_from(origin), _floats(model, root)
-            if free:
-                carrier = name = names[root]
-                rest = Frame(data.xpos[root].copy(), data.xquat[root].copy())
-                pose, rest = world.seen_from(rest), rest.seen_from(origin)
-        yield Shape(name, kind, geom.size[: SIZES.get(kind, 3)].tolist(), pose, carrier,
-                    _vertices(model, index) if kind == "mesh" else None, rest)  # fmt: skip
+        if visuals or model.geom_contype[index] or model.geom_conaffinity[index]:
+            yield _solid(model, data, names, index, links, origin)
+
+
+def _solid(
+    model: Any, data: Any, names: Sequence[str], index: int, links: Sequence[str], origin: Frame
+) -> Shape:
+    """One of the solids of a compiled model."""
+    kinds, geom, body = (
+        mujoco_module().mjtGeom,
+        model.geom(index),
+        int(model.geom_bodyid[index]),
+    )
+    kind = kinds(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
+    size, pose = (
+        geom.size[: SIZES.get(kind, 3)].tolist(),
+        Frame(geom.pos.copy(), geom.quat.copy()),
+    )
+    vertices = _vertices(model, index) if kind == "mesh" else None
+    if names[body] in links:
+        return Shape(names[body], kind, size, pose, names[body], vertices)
+    bodies = [Frame(data.xpos[i].copy(), data.xquat[i].copy()) for i in range(model.nbody)]
+    root, world = int(model.body_rootid[body]), bodies[body].compose(pose)
+    if _floats(model, root):
+        rest, pose = bodies[root].seen_from(origin), world.seen_from(bodies[root])
+        return Shape(names[root], kind, size, pose, names[root], vertices, rest)
+    name = names[body] if body else geom.name or f"geom{index}"
+    return Shape(name, kind, size, world.seen_from(origin), None, vertices)
 
 
 def _floats(model: Any, root: int) -> bool:
@@ -247,27 +258,22 @@ def urdf_solids(text: str, meshes: Path | None, visuals: bool) -> list[Shape]:
     DataError
         If no link has collision geometry, or a mesh is not found.
     """
-    source, flat = parse_xml(text), ElementTree.Element("robot", name="solids")
+    links = {str(link.get("name")): link for link in parse_xml(text).findall("link")}
+    tags = ["collision", "visual"] if visuals else ["collision"]
+    flat, root = ElementTree.Element("robot", name="solids"), free_name("root", links)
     settings = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}
     ElementTree.SubElement(ElementTree.SubElement(flat, "mujoco"), "compiler", settings)
-    links = {str(link.get("name")): link for link in source.findall("link")}
-    root, seen = free_name("root", links), False
     ElementTree.SubElement(flat, "link", name=root)
     for name, link in links.items():
-        found, seen = link.findall("collision"), seen or link.find("visual") is not None
-        found = found or (link.findall("visual") if visuals else [])
-        if not found:
-            continue
-        one = ElementTree.SubElement(flat, "link", name=name)
-        joint = ElementTree.SubElement(flat, "joint", name=name, type="fixed")
-        ElementTree.SubElement(joint, "parent", link=root)
-        ElementTree.SubElement(joint, "child", link=name)
-        for element in found:
-            solid = ElementTree.SubElement(one, "collision")
-            solid.extend(part for part in element if part.tag in ("origin", "geometry"))
-            for mesh in solid.iter("mesh"):
-                mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), name, meshes)))
+        found = next(filter(None, map(link.findall, tags)), [])
+        if found:
+            joint = ElementTree.SubElement(flat, "joint", name=name, type="fixed")
+            ElementTree.SubElement(joint, "parent", link=root)
+            ElementTree.SubElement(joint, "child", link=name)
+            one = ElementTree.SubElement(flat, "link", name=name)
+            one.extend([_collision(element, name, meshes) for element in found])
     if len(flat) == 2:
+        seen = any(link.find("visual") is not None for link in links.values())
         raise DataError(
             "no link of the robot has collision geometry"
             + (", only visuals: visuals=True takes these" if seen else "")
@@ -275,6 +281,17 @@ def urdf_solids(text: str, meshes: Path | None, visuals: bool) -> list[Shape]:
         )
     model = compiled(ElementTree.tostring(flat, encoding="unicode"))
     return [replace(one, carrier=one.name) for one in solids(model, list(links), root, True)]
+
+
+def _collision(
+    element: ElementTree.Element, link: str, meshes: Path | None
+) -> ElementTree.Element:
+    """The solid of an element of a link, with the paths of its meshes."""
+    solid = ElementTree.Element("collision")
+    solid.extend([part for part in element if part.tag in ("origin", "geometry")])
+    for mesh in solid.iter("mesh"):
+        mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), link, meshes)))
+    return solid
 
 
 def _mesh_file(name: str, link: str, folder: Path | None) -> Path:
