@@ -252,8 +252,8 @@ def statuses(
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
     if ended is not None:
         codes[ended] = Status.FINISHED.code
-    texts |= {row: reason for row, (_, reason) in obstructed.items()}
-    codes[[row for row, (waits, _) in obstructed.items() if waits]] = Status.WAITING.code
+    for row, (waits, reason) in obstructed.items():
+        codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
     for robots, reason in held:
         if robots is not None:
             codes[robots] = Status.HOLDING.code

@@ -231,14 +231,10 @@ class Controller:
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
-        self._avoidance = None
+        self._avoidance, batch = None, len(self._progress.time)
         if obstacles is not None:
-            batch = len(self._progress.time)
             self._avoidance = Avoidance.start(obstacles, kinematics, bounds, batch)
-        self._limits = None
-        if bounds is not None:  # rounded postures stay within these
-            low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
-            self._limits = low / GRID, high / GRID
+        self._limits = _limits(bounds)
         self.command: Command | None = None
 
     def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
@@ -795,6 +791,13 @@ def _motion_bounds(
     if isinstance(bounds, str) and bounds != "robot":
         raise DataError(f"bounds are MotionBounds, a mapping, 'robot' or None, got {bounds!r}")
     return skill.motion_bounds
+
+
+def _limits(bounds: MotionBounds | None) -> tuple[Tensor, Tensor] | None:
+    """Between which rounded postures stay."""
+    if bounds is None:
+        return None
+    return (bounds.lower * GRID).ceil() / GRID, (bounds.upper * GRID).floor() / GRID
 
 
 def _durations(dt: Any) -> tuple[Seconds, Flags | None]:

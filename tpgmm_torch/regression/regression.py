@@ -270,12 +270,10 @@ class Regression:
         """
         if names in self._observed:
             return self._observed[names]
-        every = [
-            self._part(operator, one, names)
-            for operator, one in zip(self.operators, self.conditionals, strict=True)
-        ]
-        kept = [index for index, part in enumerate(every) if part is not None]
-        parts = [part for part in every if part is not None]
+        pairs = zip(self.operators, self.conditionals, strict=True)
+        every = enumerate(self._part(operator, one, names) for operator, one in pairs)
+        kept = {index: part for index, part in every if part is not None}
+        parts = list(kept.values())
         found: Regression | None = None
         if [operator for operator, _ in parts] == list(self.operators):
             found = self

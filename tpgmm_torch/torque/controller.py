@@ -216,9 +216,7 @@ class TorqueController(Controller):
             self._bodies = self._gaussians.bodies
         n = start.shape[-1]
         effort = getattr(dynamics, "effort", None) if effort is None else effort
-        self._effort = torch.as_tensor(math.inf if effort is None else effort).to(start)
-        if self._effort.shape not in ((), (n,)) or not bool((self._effort > 0).all()):
-            raise DataError(f"effort has a torque above 0 for each of {n} joints: {effort!r}")
+        self._effort = _checked_effort(math.inf if effort is None else effort, start)
         inertia, bias = dynamics(start, zero)
         if inertia.shape != (*start.shape, n) or bias.shape != start.shape:
             raise ShapeError(
@@ -446,3 +444,11 @@ class TorqueController(Controller):
             value = value + self._gains.integral * counts * error
             values[one.operator] = value.clamp(-most, most)
         return values
+
+
+def _checked_effort(effort: Any, start: Tensor) -> Tensor:
+    """The largest torque of each joint, or of all."""
+    given, n = torch.as_tensor(effort).to(start), start.shape[-1]
+    if given.shape not in ((), (n,)) or not bool((given > 0).all()):
+        raise DataError(f"effort has a torque above 0 for each of {n} joints: {effort!r}")
+    return given
