@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -523,9 +524,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         options = self.config.control.options()
         if self.config.obstacles is not None:
-            path, _, visuals = self.config.obstacles.partition(":")
-            options["obstacles"] = Scene(self.kinematics, path, visuals=visuals == "visuals")
+            options["obstacles"] = self._scene
         return Controller(self.skill, joints, frames, **options)
+
+    @cached_property
+    def _scene(self) -> Scene:
+        """The obstacles, and links that come near each other as they were shown to."""
+        path, _, visuals = (self.config.obstacles or "").partition(":")
+        scene = Scene(self.kinematics, path, visuals=visuals == "visuals")
+        return scene.allowing_skill(self.skill)
 
     def _measurements(
         self, batch: Mapping[str, Tensor], controller: Controller

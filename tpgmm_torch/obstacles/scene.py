@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -11,13 +11,14 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from tpgmm_torch import quaternions
+from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.obstacles.distances import Geometry
 from tpgmm_torch.obstacles.shapes import Shape, compiled, excluded, solids, urdf_solids
+from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.robots.robot import Robot
@@ -33,6 +34,9 @@ CLEARANCE = 0.01
 #: Postures of which all have to show two links of a robot overlap for that to be how coarse its
 #: solids are.
 POSTURES = 50
+#: Motions that are drawn from a skill in place of its demonstrations: one in twenty of all that
+#: are likely comes nearer than the nearest of them.
+MOTIONS = 20
 #: Instants of a demonstration that are looked at [s].
 STEP = 0.05
 
@@ -261,6 +265,32 @@ class Scene:
         other._allow({p: text.format(-1e3 * d) for p, d in least.items() if d <= 0})
         return other
 
+    def allowing_skill(self, skill: Any) -> Self:
+        """The scene with pairs of links allowed that come near each other in a skill.
+
+        For a saved skill, whose demonstrations are not at hand: motions are drawn from its
+        operators of all joints, :class:`~tpgmm_torch.Canonical`. Without such an operator the
+        scene stays as it is.
+
+        Parameters
+        ----------
+        skill : Skill
+        """
+        shown = []
+        away = {name: Frame([1e3] * 3) for name in self.geometry.objects}
+        for one in _mixtures(skill):
+            for index, operator in enumerate(one.operators):
+                if isinstance(operator, Canonical) and operator.joints is None:
+                    local, time = one.conditionals[index], one.time
+                    mean, covariance = gaussians.moment_match(
+                        one.weights_at(time), local.at(time), local.covariance
+                    )
+                    factor = gaussians.cholesky(covariance, "the joints")
+                    draws = torch.randn(MOTIONS, mean.shape[1], generator=_seeded()).to(mean)
+                    for way in mean + (factor @ draws.mT).movedim(-1, 0):
+                        shown.append(Demonstration(time, way, away, one.kinematics.joint_names))
+        return self.allowing(shown)
+
     def _known(self, names: Sequence[str]) -> Pair:
         """A pair of solids that exist."""
         for name in (pair := _pair(names)):
@@ -285,7 +315,7 @@ class Scene:
         """Links that overlap in all postures."""
         self._allow({})
         robot, links = self.robot, set(self.robot.model.links)
-        draw = torch.rand(POSTURES, robot.n_joints, generator=torch.Generator().manual_seed(0))
+        draw = torch.rand(POSTURES, robot.n_joints, generator=_seeded())
         low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
         far = {name: Frame(np.full(3, 1e3)) for name in self.geometry.objects}
         near = self.distances(torch.lerp(low, high, draw.to(low)), far, 1e-3)
@@ -294,6 +324,19 @@ class Scene:
             for pair, values in near.items()
             if (values < 0).all() and links.issuperset(pair)
         }
+
+
+def _seeded() -> torch.Generator:
+    """Random numbers that are the same each time."""
+    return torch.Generator().manual_seed(0)
+
+
+def _mixtures(skill: Any) -> Iterator[Any]:
+    """The fitted mixtures that a skill is made of."""
+    if hasattr(skill, "operators"):
+        yield skill
+    for one in (*getattr(skill, "skills", ()), *filter(None, [getattr(skill, "skill", None)])):
+        yield from _mixtures(one)
 
 
 def _pair(names: Sequence[str]) -> Pair:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.skills import small_bottle
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_datasets.robots import upper_body_urdf
@@ -157,6 +158,16 @@ def test_pairs_that_demonstrations_bring_near_are_allowed_by_name():
         for one in find_contacts(allowing, shown[0].time, shown[0].joints, frames)
     }
     assert ("r_hand", "table") in touched and ("l_hand", "bottle") not in touched
+
+
+def test_a_saved_skill_allows_links_that_it_brings_near():
+    skill = small_bottle().skill
+    scene = Scene(skill.kinematics, [Shape.table(-1.0)], visuals=True).allowing_skill(skill)
+    way = skill.expected(1, skill.time)
+    assert {*scene.distances(way, within=0.01)} <= {*scene.closer}  # and may be as near
+    assert not {pair for pair in {*scene.allowed, *scene.closer} if "table" in pair}
+    alone = Scene(skill.kinematics, [Shape.table(-1.0)], visuals=True)
+    assert {*alone.distances(way, within=0.0)} <= {*scene.allowed}
 
 
 def test_the_robot_may_stand_in_the_file_and_excludes_allow_pairs():
