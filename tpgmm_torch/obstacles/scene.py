@@ -372,16 +372,11 @@ def _moving_pairs(robot: Robot, shapes: Sequence[Shape]) -> Any:
     above = {joint.child: joint.parent for joint in robot.model.joints}
     base, model = robot.config()["base"], robot.model
     links = [one.carrier in robot.model.links for one in shapes]
-    parts = [
-        _part(robot, one.carrier or base)
-        if one.carrier in (None, *model.links)
-        else one.carrier
-        for one in shapes
-    ]
+    carriers = [one.carrier or base for one in shapes]
+    parts = [_part(robot, name) if name in model.links else name for name in carriers]
     # the part from which the joint of a part hangs
-    nearer = [_part(robot, above[part]) if part in above else None for part in parts]
-    codes = {name: at for at, name in enumerate(dict.fromkeys((None, *parts, *nearer)))}
-    own, near = (np.array([codes[x] for x in names]) for names in (parts, nearer))
+    nearer = [_part(robot, above[part]) if part in above else "" for part in parts]
+    own, near = np.unique([parts, nearer], return_inverse=True)[1].reshape(2, -1)
     first, second = np.triu_indices(len(shapes), 1)
     both = np.array(links)[first] & np.array(links)[second]
     connected = both & ((near[first] == own[second]) | (near[second] == own[first]))

@@ -273,12 +273,12 @@ class Regression:
         pairs = zip(self.operators, self.conditionals, strict=True)
         every = enumerate(self._part(operator, one, names) for operator, one in pairs)
         kept = {index: part for index, part in every if part is not None}
-        parts = list(kept.values())
+        operators = tuple(operator for operator, _ in kept.values())
         found: Regression | None = None
-        if [operator for operator, _ in parts] == list(self.operators):
+        if list(operators) == list(self.operators):
             found = self
-        elif any(operator.constrains_joints for operator, _ in parts):
-            operators, conditionals = zip(*parts, strict=True)
+        elif of_joints(operators):
+            _, conditionals = zip(*kept.values(), strict=True)
             fusion = self.fusion
             if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
                 fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
