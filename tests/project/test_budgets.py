@@ -54,10 +54,10 @@ CEILINGS = {
     "lines of tpgmm_torch": 16550,
     "lines of tpgmm_datasets": 4835,
     "lines of lerobot_policy_tpgmm": 2070,
-    "lines of tpgmm_tools": 2965,
+    "lines of tpgmm_tools": 2995,
     "lines of tpgmm_vision": 2845,
     "lines of environments and evaluation": 10500,
-    "lines of tests of core, data sets, policy and tools": 21050,
+    "lines of tests of core, data sets, policy and tools": 21075,
     "longest function of the core": 81,
     "named numeric constants of the core": 156,
 }

@@ -10,7 +10,6 @@ import typer
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Trajectory
@@ -115,25 +114,10 @@ def reproduce(
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
     if obstacles is not None:
-        scene = _scene(obstacles, kinematics, visuals, shown)
+        scene = options.scene(obstacles, kinematics, visuals, shown)
         pairs = zip(trajectories, wanted, strict=True)
         if _touches(scene, [(t, s.frames_at(t.time.cpu())) for t, s in pairs], skill.holds):
             raise typer.Exit(COLLIDES)
-
-
-def _scene(
-    file: Path, kinematics: Kinematics, visuals: bool, shown: list[Demonstration]
-) -> Scene:
-    """The robot among obstacles; what is allowed is listed."""
-    from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.obstacles import Scene
-
-    if not file.is_file():
-        raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
-    scene = Scene(kinematics, file, visuals=visuals).allowing(shown)
-    for (one, other), reason in scene.allowed.items():
-        typer.echo(f"allowed: {one} and {other} ({reason})")
-    return scene
 
 
 def _touches(
