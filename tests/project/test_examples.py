@@ -161,15 +161,6 @@ CLAIMS = {
             and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
         ),
     ),
-    "plot_21_try_again.py": (
-        1,
-        lambda v: (
-            (np.diff(v["progress"]) < 0).sum() == 2
-            and np.linalg.norm(v["cup"] - v["tray"]) < 0.01
-            and np.linalg.norm(v["hand"] - v["START"]) < 0.02
-            and set(v["status"]) == {"running", "waiting"}
-        ),
-    ),
     "plot_19_contact.py": (
         1,
         lambda v: (
@@ -182,6 +173,15 @@ CLAIMS = {
     "plot_20_obstacles.py": (
         1,
         lambda v: v["distances"]["alone"].min() < -20 and v["distances"]["around"].min() > 5,
+    ),
+    "plot_21_try_again.py": (
+        1,
+        lambda v: (
+            (np.diff(v["progress"]) < 0).sum() == 2
+            and np.linalg.norm(v["cup"] - v["tray"]) < 0.01
+            and np.linalg.norm(v["hand"] - v["START"]) < 0.02
+            and set(v["status"]) == {"running", "waiting"}
+        ),
     ),
 }
 
