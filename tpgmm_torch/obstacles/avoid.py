@@ -3,7 +3,7 @@
 As long as the ordinary reference keeps its distances, and can be stopped before it does not, it
 is sent as it is. Elsewhere a robot is *led*: one convex problem decides where each joint would
 come to rest if it braked after this tick, and so where it is then
-(:mod:`~tpgmm_torch.motion.braking`). The ways x to rest
+(:mod:`~tpgmm_torch.motion.braking`). The ways x to rest are those of ::
 
     minimise  sum over hands of |J_p x - e_p|^2 / P^2 + |J_o x - e_o|^2 / O^2
               + |x - e|^2 / Q^2 + |x - r|^2 / C^2
