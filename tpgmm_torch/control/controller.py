@@ -170,8 +170,8 @@ class Controller:
     at_rest : bool
         Whether robots stand when the skill begins; else they move as the skill does.
     obstacles : Scene, optional
-        What references keep clear of (:class:`~tpgmm_torch.obstacles.scene.Scene`). Time waits for
-        robots that are kept too far off, and before something is taken or put; not with the
+        What references keep clear of (:class:`~tpgmm_torch.obstacles.scene.Scene`). Time waits
+        for robots that are kept too far off, and before something is taken or put; not with the
         clock ``"even"``. The command's reason says what is in the way.
 
     Attributes
