@@ -77,13 +77,13 @@ distances = {name: distance(joints) for name, joints in (("alone", free), ("arou
 plt.style.use(STYLE)
 figure, (side, over) = plt.subplots(1, 2, figsize=(8, 3.4))
 for name, way, color in (("alone", path, VERMILION), ("around", clear, BLUE)):
-    side.plot(way[:, 1], way[:, 2], color=color, label=f"left hand, {name}")
-    over.plot(time, distances[name], color=color)
+    side.plot(way[:, 1], way[:, 2], color=color)
+    over.plot(time, distances[name], color=color, label=f"left hand, {name}")
 centre = ball.pose.position
 side.add_patch(plt.Circle((centre[1], centre[2]), 0.03, color="0.7"))
 side.set(xlabel="y [m]", ylabel="z [m]", aspect="equal")
-side.legend()
 over.axhline(0, color="0.3", linewidth=0.8)
 over.axhline(10, color="0.6", linestyle="--", linewidth=0.8)
 over.set(xlabel="time [s]", ylabel="robot to ball [mm]")
+over.legend()
 figure.tight_layout()
