@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,9 +116,7 @@ def _placed(
     holds = shown.holds
     if holds is not None:
         holds = tuple(hold.retimed(clock) for hold in holds)
-    return Demonstration(
-        clock(shown.time), shown.joints, shown.frames, shown.joint_names, events, holds
-    )
+    return replace(shown, time=clock(shown.time), events=events, holds=holds)
 
 
 def _features(skill: Skill, joints: torch.Tensor) -> Array:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import UnionType
+from types import FunctionType, MethodType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -265,6 +265,11 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
 
 def _described(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
     """An object as the name of its class and its fields."""
+    if isinstance(thing, FunctionType | MethodType):
+        raise ModelFileError(
+            f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
+            "conditions by name ('arrived', 'held', ...), or make the sequence where it runs"
+        )
     if isinstance(thing, np.generic):
         return encode(thing.item())
     name = type(thing).__name__

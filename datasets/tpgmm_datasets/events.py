@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
+import torch
 
 from tpgmm_datasets.checks.check import PACKAGE
 from tpgmm_torch.checks.report import Finding, Report
@@ -54,7 +55,8 @@ SIGNALS = {
 }
 GRAMMAR = (
     "closing:SIGNALS and opening:SIGNALS (begin and end of the longest time that a gripper is "
-    "low), contact:SIGNALS and release:SIGNALS (of the longest time that a force is high; also "
+    "low), contact:SIGNALS and release:SIGNALS (of the longest time that a force is high, "
+    "a link's wrench too; also "
     "of grippers that are high when closed), each with names or patterns joined by commas; "
     "moving:FRAME (an object starts to move); stop:LINK, stop:LINK:2 (a link comes to rest: "
     "the longest time, the second time)"
@@ -123,7 +125,7 @@ class SignalEvent(Detector):
     Parameters
     ----------
     signals : tuple of str
-        Joints by name, or patterns with ``*``.
+        Joints, or links of which the size of the force counts, by name or patterns with ``*``.
     edge : {"begin", "end"}
         Of the stretch.
     level : {"low", "high"}
@@ -158,7 +160,7 @@ class SignalEvent(Detector):
     def find(self, demonstration: Demonstration, robot: Any = None) -> Detection:
         """See :meth:`Detector.find`."""
         time = _time(demonstration)
-        values = as_array(demonstration.joints)[:, self._columns(demonstration)]
+        values = self._values(demonstration)
         share, contrast = between_levels(without_spikes(values, time))
         share = 1 - share if self.level == "low" else share
         stretches = high_stretches(share, ON, 1 - ON)
@@ -174,8 +176,16 @@ class SignalEvent(Detector):
         steepness = max(0.0, 1 - 2 * change / max(lengths[longest], 1e-9))
         return Detection(at, float(contrast * steepness * _uniqueness(lengths, longest)))
 
-    def _columns(self, demonstration: Demonstration) -> list[int]:
-        names = demonstration.joint_names or ()
+    def _values(self, demonstration: Demonstration) -> Array:
+        """The joints of these names, and the sizes of forces of the links of these names."""
+        forces = demonstration.wrenches
+        names = (*(demonstration.joint_names or ()), *forces)
+        sizes = [force[:, :3].norm(dim=1, keepdim=True) for force in forces.values()]
+        unnamed = demonstration.joints[:, : 0 if demonstration.joint_names is None else None]
+        values: Array = as_array(torch.cat((unnamed, *sizes), 1))
+        return values[:, self._columns(names)]
+
+    def _columns(self, names: Sequence[str]) -> list[int]:
         columns: set[int] = set()
         for pattern in self.signals:
             fits = {i for i, n in enumerate(names) if n == pattern or fnmatchcase(n, pattern)}

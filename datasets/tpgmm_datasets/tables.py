@@ -2,8 +2,10 @@
 
 A row is a time step. The columns are ``episode``, ``time`` [s], the joints by name, the seven
 numbers of each frame (``bottle.x``, ``bottle.y``, ``bottle.z`` [m], ``bottle.qw`` to
-``bottle.qz``), the time of each event (``event.close`` [s], the same in all rows of an episode)
-and, of trajectories, the upper triangle of the joints' covariance (``covariance.elbow.wrist``).
+``bottle.qz``), the wrench of each link (``wrench.tool.fx`` to ``wrench.tool.fz`` [N] and
+``wrench.tool.tx`` to ``wrench.tool.tz`` [N m]), the time of each event (``event.close`` [s],
+the same in all rows of an episode) and, of trajectories, the upper triangle of the joints'
+covariance (``covariance.elbow.wrist``).
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ __all__ = [
     "write_table",
 ]
 
-EVENT, COVARIANCE = "event.", "covariance."
+EVENT, COVARIANCE, WRENCH = "event.", "covariance.", "wrench."
+#: What a column of a wrench is, behind its link.
+WRENCH_PARTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 #: The column that may be missing.
 EPISODE = "episode"
 #: Where pandas keeps which columns are joints, among the attributes of a table.
@@ -104,6 +108,7 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
     checked = check_demonstrations(demonstrations)
     parts = [
         _columns(episode, one, one.frames)
+        | _wrench_columns(one)
         | {f"{EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
         for episode, one in enumerate(checked)
     ]
@@ -206,7 +211,8 @@ def demonstrations_from_frame(
                 torch.from_numpy, (numbers(kept, [time])[:, 0], numbers(kept, names))
             )
             poses, events = _poses(kept, {time, episode, *names}), _events(kept)
-            made.append(Demonstration(at, values, poses, called, events))
+            forces = {n: torch.from_numpy(w) for n, w in _wrenches(kept).items()}
+            made.append(Demonstration(at, values, poses, called, events, wrenches=forces))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
     return made
@@ -465,7 +471,7 @@ def _others(table: pd.DataFrame, known: set[str]) -> list[str]:
     return [
         name
         for name in table.columns
-        if name not in known and not name.startswith((EVENT, COVARIANCE))
+        if name not in known and not name.startswith((EVENT, COVARIANCE, WRENCH))
     ]
 
 
@@ -478,6 +484,28 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
         pose = pose[0] if bool((pose == pose[0]).all()) else pose
         frames[name] = Frame(pose[..., :3], pose[..., 3:])
     return frames
+
+
+def _wrench_columns(motion: Demonstration) -> dict[str, Array]:
+    """The values of wrenches, by column."""
+    return {
+        f"{WRENCH}{link}.{part}": values
+        for link, wrench in motion.wrenches.items()
+        for part, values in zip(WRENCH_PARTS, as_array(wrench).T, strict=True)
+    }
+
+
+def _wrenches(part: pd.DataFrame) -> dict[str, Array]:
+    """Wrenches (T, 6) by link."""
+    columns = [name for name in part.columns if name.startswith(WRENCH)]
+    links = dict.fromkeys(name.removeprefix(WRENCH).rpartition(".")[0] for name in columns)
+    found = {
+        link: numbers(part, [f"{WRENCH}{link}.{axis}" for axis in WRENCH_PARTS])
+        for link in links
+    }
+    if odd := [name for name in columns if name.rpartition(".")[2] not in WRENCH_PARTS]:
+        raise DataError(f"columns {odd} are none of {WRENCH}LINK. and {list(WRENCH_PARTS)}")
+    return found
 
 
 def _events(part: pd.DataFrame) -> dict[str, float]:

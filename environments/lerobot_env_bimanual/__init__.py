@@ -18,7 +18,7 @@ from lerobot_env_bimanual.control_rate import rate_processors
 from lerobot_env_bimanual.disturbances import NOMINAL
 from lerobot_env_bimanual.metaworld.tasks import check_task
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
-from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
@@ -214,9 +214,12 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
     Parameters
     ----------
     task : str, default="handover"
-        One of :data:`~lerobot_env_bimanual.suite.names.SUITE`.
+        One of :data:`~lerobot_env_bimanual.suite.names.SUITE`, or ``pick_place``.
     robot : str, default="upper_body"
         One of :data:`~lerobot_env_bimanual.suite.names.ROBOTS`.
+    force : bool, default=False
+        Whether wrenches of both hands are observed, ``observation.wrench.l_hand`` and
+        ``observation.wrench.r_hand``.
     features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot; the features follow from task and robot.
     fps, episode_length, pushes, noise, condition, cameras, camera_width, camera_height, \
@@ -231,11 +234,12 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
 
     task: str | None = "handover"
     robot: str = UPPER_BODY
+    force: bool = False
 
     def __post_init__(self) -> None:
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
-        self._observe(SUITE, ROBOTS[self.robot])
+        self._observe({**SUITE, **MORE}, ROBOTS[self.robot])
         super().__post_init__()
 
 

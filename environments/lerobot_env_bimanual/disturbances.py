@@ -22,8 +22,8 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = [
     "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
-    "Live", "Moved", "NoisyPose", "PoseLost", "Sagging", "StartedMidway", "Stopped",
-    "displaced", "generators", "parse_condition",
+    "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "Spoilt",
+    "StartedMidway", "Stopped", "displaced", "generators", "parse_condition",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -356,6 +356,36 @@ class Biased(_Lasting):
 
 
 @dataclass(frozen=True)
+class Misplaced(_Lasting):
+    """Each object is not where it is observed: a table that was measured badly.
+
+    Parameters
+    ----------
+    height : float, default=0
+        How much higher it is, along its own z axis [m].
+    angle : float, default=0
+        How far it is tilted, about an axis in its own plane that is drawn [rad].
+    """
+
+    height: float = 0.0
+    angle: float = 0.0
+
+    def seen(
+        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
+    ) -> Vector:
+        """Where it is not."""
+        thought, way = poses.copy(), np.random.default_rng(self.seed).uniform(0, 2 * math.pi)
+        tilt = self.angle * np.array((math.cos(way), math.sin(way), 0.0))
+        for pose in thought.reshape(-1, POSE):
+            w, x, y, z = pose[3:]
+            upwards = np.array(
+                (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+            )
+            pose[:] = displaced(pose, np.concatenate((-self.height * upwards, tilt)))
+        return thought
+
+
+@dataclass(frozen=True)
 class Sagging(_Lasting):
     """Each joint stands off its reference, to a side that is drawn: drives under load.
 
@@ -439,6 +469,40 @@ class Live(Disturbance):
     live: ClassVar[bool] = True
 
 
+@dataclass(frozen=True)
+class Spoilt(Disturbance):
+    """The first grasp of the first object fails: it slips out of the hand when it is lifted.
+
+    Parameters
+    ----------
+    distance : float, default=0
+        Above 0 the hand pushes it aside by this as it closes, and does not take it [m].
+    seconds : float, default=15.0
+        How much longer an episode is for it.
+    step : ndarray of shape (6,), optional
+        The displacement: [m], then [rad].
+    """
+
+    live: ClassVar[bool] = True
+    distance: float = 0.0
+    seconds: float = 15.0
+    step: Vector | None = dataclasses.field(default=None, compare=False)
+
+    @property
+    def delay(self) -> float:
+        """To try again."""
+        return self.seconds
+
+    def drawn(
+        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
+    ) -> Self:
+        """With the displacement of the episode, as of :class:`Moved`."""
+        if not self.distance:
+            return self
+        moved = Moved(self.distance, 0.0, step=self.step).drawn(rng, course, usual)
+        return dataclasses.replace(self, step=moved.step)
+
+
 _KINDS: Mapping[str, Disturbance] = MappingProxyType(
     {
         "stopped": Stopped(),
@@ -454,13 +518,20 @@ _KINDS: Mapping[str, Disturbance] = MappingProxyType(
         "pose-lost": PoseLost(),
         "pose-stale": PoseLost(stale=True),
         "irregular-ticks": IrregularTicks(),
+        "lower": Misplaced(height=-0.005),
+        "higher": Misplaced(height=0.005),
+        "tilted": Misplaced(angle=math.radians(3)),
+        "slips": Spoilt(),
+        "knocked": Spoilt(distance=0.04),
     }
 )
+#: Those of one task.
+OF_ONE_TASK = ("lower", "higher", "tilted", "slips", "knocked")
 _NUMBER = r"(\d+(?:\.\d+)?)"
 #: Those that a comparison runs through. At 3 s a stop keeps the hands from the grasp.
 CONDITIONS = (
     *(NOMINAL, "stopped-1", "stopped-2", "stopped-3", "stopped-5", "stopped-10", "stopped-3@3"),
-    *(name for name in _KINDS if name != "stopped"),
+    *(name for name in _KINDS if name not in ("stopped", *OF_ONE_TASK)),
 )
 
 
@@ -473,8 +544,9 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         ``"nominal"``, or names joined by ``+``: ``stopped``, ``pushed-back``,
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
         ``pose-noise``, ``biased``, ``sagging``, ``pose-lost``, ``pose-stale``,
-        ``irregular-ticks``. A number behind a name says how many seconds, ``stopped-3``, and
-        one behind ``@`` when it happens, if that is not to be drawn: ``pushed-back-1.5@6``.
+        ``irregular-ticks``, ``lower``, ``higher``, ``tilted``, ``slips``, ``knocked``. A number
+        behind a name says how many seconds, ``stopped-3``, and one behind ``@`` when it
+        happens, if that is not to be drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------

@@ -36,14 +36,16 @@ from lerobot_env_bimanual.so101.env import BiSo101Env
 from lerobot_env_bimanual.so101.expert import teleoperated
 from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
 from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
-from tpgmm_torch import Demonstration
+from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
-__all__ = ["CALIBRATION", "EXPERTS", "Expert", "expert", "main", "record"]
+__all__ = [
+    "CALIBRATION", "EXPERTS", "Expert", "demonstrate_forces", "expert", "main", "record",
+]  # fmt: skip
 
 Vector = NDArray[np.float64]
 #: Time steps per second of the experts' motions, whatever the rate of the set.
@@ -112,7 +114,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
     """
     if task not in EXPERTS:
         raise UnknownNameError("task", task, "the recorder", EXPERTS)
-    if task in SUITE:
+    if task in SUITE or task in MORE:
         able = suite_task(task, robot)
         made, of = partial(SuiteEnv, task, robot), partial(able.demonstrations, rate=RATE)
         return Expert(made, lambda seed: of(1, seed)[0], able.objects)
@@ -135,7 +137,7 @@ ALONE = {
     "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperated),
 }
 #: What can be recorded.
-EXPERTS = (*ALONE, *SUITE)
+EXPERTS = (*ALONE, *SUITE, *MORE)
 
 
 def record(
@@ -294,6 +296,53 @@ def _demonstrate(
     raise DataError(
         f"of {ATTEMPTS * n} demonstrations {opened.num_episodes} succeed, {n} are asked for"
     )
+
+
+def demonstrate_forces(
+    task: str, n: int = 5, seed: int = 0, *, fps: int = 50, robot: str = UPPER_BODY
+) -> list[Demonstration]:
+    """Demonstrations with wrenches: what the robot measures while it follows the expert.
+
+    Parameters
+    ----------
+    task : str
+        Of the suite.
+    n : int, default=5
+        How many.
+    seed : int, default=0
+    fps : int, default=50
+        Time steps per second.
+    robot : str, default="upper_body"
+
+    Returns
+    -------
+    list of Demonstration
+        The joints are measured, the frames those of the beginning.
+    """
+    able, found = expert(task, robot), list[Demonstration]()
+    env = able.environment(fps=fps, force=True)
+    for number in range(n):
+        seen, actions = able.begin(env, np.random.default_rng((seed, number)))
+        every = [seen]
+        for reference in actions:
+            seen, _, _, over, _ = env.step(reference)
+            every.append(seen)
+            if over:
+                break
+        rows = {key: torch.from_numpy(np.stack([one[key] for one in every])) for key in seen}
+        poses = rows["environment_state"][0].view(-1, 7)
+        objects = zip(able.objects, poses, strict=True)
+        found.append(
+            Demonstration(
+                rows["timestamp"][:, 0],
+                rows["agent_pos"],
+                {name: Frame(pose[:3], pose[3:]) for name, pose in objects},
+                env.joint_names,
+                wrenches={hand: rows[f"wrench.{hand}"] for hand in HANDS},
+            )
+        )
+    env.close()
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

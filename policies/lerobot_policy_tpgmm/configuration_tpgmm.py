@@ -125,6 +125,9 @@ class TPGMMConfig(StatePolicyConfig):
         :meth:`tpgmm_torch.skills.via_point.ViaPoint.parse` reads them.
     via_fade : float, default=1.0
         For how long before and after a via-point the skill is another [s].
+    obstacles : str, optional
+        An MJCF file with what references keep clear of, read when an episode begins;
+        ``"scene.xml:visuals"`` takes visual geometry of a robot that has no other.
     robot : dict or str, optional
         The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
         the URDF in it; to begin with, the path of a URDF or an MJCF, ``"upper_body"``,
@@ -184,6 +187,7 @@ class TPGMMConfig(StatePolicyConfig):
     holds: list[str] | None = None
     via_points: list[str] | None = None
     via_fade: float = 1.0
+    obstacles: str | None = None
     robot: dict[str, Any] | str | None = None
     links: list[str] = field(default_factory=list)
     joints: list[str] | str | None = None

@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -32,6 +33,7 @@ from lerobot_policy_tpgmm.policy_files import PATTERNS, read_model, write_files
 from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
+from tpgmm_datasets.lerobot.columns import WRENCH
 from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
@@ -46,6 +48,7 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     TPGMMError,
 )
+from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
@@ -411,8 +414,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``observation.state`` (B, n_state) and what the frames are read from; in the middle
             of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
             much time has passed [s], where it is there; what a tick comes late is caught up by
-            those that follow. With a cell, the pictures of its cameras (B, 3, height, width) in
-            [0, 1]: robots stand until all objects were seen.
+            those that follow. ``observation.wrench.LINK`` (B, 6) is what a link exerts. With a
+            cell, the pictures of its cameras (B, 3, height, width) in [0, 1]: robots stand
+            until all objects were seen.
 
         Returns
         -------
@@ -518,7 +522,17 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         frames = self.frames.frames(batch)
         if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
-        return Controller(self.skill, joints, frames, **self.config.control.options())
+        options = self.config.control.options()
+        if self.config.obstacles is not None:
+            options["obstacles"] = self._scene
+        return Controller(self.skill, joints, frames, **options)
+
+    @cached_property
+    def _scene(self) -> Scene:
+        """The obstacles, and links that come near each other as they were shown to."""
+        path, _, visuals = (self.config.obstacles or "").partition(":")
+        scene = Scene(self.kinematics, path, visuals=visuals == "visuals")
+        return scene.allowing_skill(self.skill)
 
     def _measurements(
         self, batch: Mapping[str, Tensor], controller: Controller
@@ -538,6 +552,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
         return measured if config.control.closed_loop else None, poses or None
 
+    def _wrenches(
+        self, batch: Mapping[str, Tensor], controller: Controller
+    ) -> dict[str, Tensor]:
+        """Wrenches of links, ``observation.wrench.LINK``, as they were measured."""
+        links = {WRENCH + link: link for link in self.kinematics.links}
+        shape = *controller.reference.shape[:-1], 6
+        return {links[key]: batch[key].reshape(shape) for key in links.keys() & batch.keys()}
+
     def _step(
         self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
     ) -> Tensor:
@@ -546,7 +568,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         measured = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
         passed = float(passed) if start.ndim == 1 else passed
-        command = controller.step(passed, *measured, ages=self._ages)
+        wrenches = self._wrenches(batch, controller)
+        command = controller.step(passed, *measured, ages=self._ages, wrenches=wrenches)
         if first:
             self._check_start(start, command.estimate.joints)
         self._log(command)

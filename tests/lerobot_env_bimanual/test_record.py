@@ -67,7 +67,13 @@ def test_a_calibration_is_an_ordinary_episode(tmp_path, monkeypatch):
 def test_what_is_not_there_is_refused(tmp_path, capsys):
     with pytest.raises(UnknownNameError, match="pour"):
         expert("fly")
-    assert set(EXPERTS) == {"bottle_shaking", "carry_and_put", *module.TASKS, *module.SUITE}
+    assert set(EXPERTS) == {
+        "bottle_shaking",
+        "carry_and_put",
+        *module.TASKS,
+        *module.SUITE,
+        *module.MORE,
+    }
     out = ["--out", str(tmp_path / "set")]
     assert main(["--task", "pour", "--cameras", "top", *out]) == 1
     assert main(["--task", "pour", "--cameras", "", *out]) == 1

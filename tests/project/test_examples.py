@@ -161,6 +161,28 @@ CLAIMS = {
             and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
         ),
     ),
+    "plot_19_contact.py": (
+        1,
+        lambda v: (
+            v["model"].operators_[-1].axes == (2,)
+            and max(abs(v["pressed"]["with admittance", e] - 8) for e in (-5, 0, 5)) < 0.2
+            and v["pressed"]["positions alone", -5] == 0
+            and v["pressed"]["positions alone", 5] > 15
+        ),
+    ),
+    "plot_20_obstacles.py": (
+        1,
+        lambda v: v["distances"]["alone"].min() < -20 and v["distances"]["around"].min() > 5,
+    ),
+    "plot_21_try_again.py": (
+        1,
+        lambda v: (
+            (np.diff(v["progress"]) < 0).sum() == 2
+            and np.linalg.norm(v["cup"] - v["tray"]) < 0.01
+            and np.linalg.norm(v["hand"] - v["START"]) < 0.02
+            and set(v["status"]) == {"running", "waiting"}
+        ),
+    ),
 }
 
 

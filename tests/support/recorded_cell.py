@@ -97,13 +97,13 @@ def record(folder: Path, episodes: int = 5, postures: int = 14, seed: int = 0) -
         "cameras": {"front": camera_content(CAMERA, KEY) | {"pose": pose_content(VIEW)}},
         "objects": {
             "cup": {
-                "target": {"cube": list(CUP.corners), "size": CUP.size},
+                "target": {"cube": list(CUP.corners), "size": _edge(CUP)},
                 "pose": pose_content(CUP_IN_CUBE),
                 "upright": True,
             }
         },
         "checks": {
-            "base": {"target": {"tag": 0, "size": BASE.size}, "pose": pose_content(BASE_TAG)}
+            "base": {"target": {"tag": 0, "size": _edge(BASE)}, "pose": pose_content(BASE_TAG)}
         },
     }
     (folder / "true_cell.json").write_text(json.dumps(content), encoding="utf-8")
@@ -221,3 +221,9 @@ def _board(folder: Path, rng: np.random.Generator, n: int = 16) -> None:
         small = cv2.resize(seen, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
         small = small + 2 * rng.standard_normal(small.shape)
         cv2.imwrite(str(folder / f"{number:02}.png"), small.clip(0, 255).astype(np.uint8))
+
+
+def _edge(target) -> float:
+    """Edge of a target's tags [m]."""
+    first, second, *_ = next(iter(target.corners.values()))
+    return float(np.linalg.norm(second - first))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.fetching import skills
 from tests.support.skills import (
     canonical,
     few_bottles,
@@ -105,6 +106,22 @@ def test_a_skill_is_what_it_was(name, tmp_path):
     with pytest.raises(ModelFileError, match="a model of one way and one part"):
         load_model(tmp_path / "skill")
     assert type(load_skill(tmp_path / "skill")) is type(skill)
+
+
+def test_a_sequence_keeps_its_conditions_and_functions_are_refused(tmp_path):
+    text = "pick until held retry 2, place until free retry 1 from pick, home"
+    sequence = Sequence.parse(text, skills(), timeout=1.5)
+    save(sequence, tmp_path / "skill")
+    again = load(tmp_path / "skill")
+    assert again.gates == sequence.gates and again.names == sequence.names
+    assert again.holds == sequence.holds and again.fade == sequence.fade
+
+    def full(moment: object) -> bool:
+        return True
+
+    with pytest.raises(ModelFileError, match=r"the Python function 'full' cannot be saved"):
+        save(replace(sequence, until=("held", full, None)), tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_what_is_held_is_kept_to_the_end(tmp_path):

@@ -288,7 +288,8 @@ def plot_local(
         )
         for i, demonstration in enumerate(demonstrations)
     ]
-    for trajectory, frames, style in reproductions:
+    # what a reproduction would feel nobody knows
+    for trajectory, frames, style in reproductions if chosen.constrains_joints else ():
         motion = Demonstration(trajectory.time, trajectory.joints, frames)
         look = {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, "label": "reproduction"}
         shown.append((motion, {**look, **style}))

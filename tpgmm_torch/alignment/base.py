@@ -82,7 +82,12 @@ def retime(
     if holds is not None:  # those outside the path shrink to an instant, and are left out
         holds = tuple(h.retimed(clock) for h in holds if clock(h.begin) < clock(h.end))
     time = time.to(demonstration.time)
-    return Demonstration(time, moved, frames, demonstration.joint_names, events, holds)
+    names = demonstration.joint_names
+    wrenches = {
+        link: torch.lerp(wrench[lower], wrench[lower + 1], fraction.to(wrench)[:, None])
+        for link, wrench in demonstration.wrenches.items()
+    }
+    return Demonstration(time, moved, frames, names, events, holds, wrenches)
 
 
 class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.control.gates import Gates
 from tpgmm_torch.control.locate import HELD, Progress
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -29,9 +30,9 @@ class Status(StrEnum):
     """Whether a robot follows its skill; in tensors by its ``code``."""
 
     RUNNING = "running"  #: the skill goes on
-    WAITING = "waiting"  #: a joint does not follow its reference
+    WAITING = "waiting"  #: for a joint that does not follow, or for the end of a skill
     DISPLACED = "displaced"  #: somebody else has moved it
-    HOLDING = "holding"  #: it stands, because what came in cannot be trusted
+    HOLDING = "holding"  #: it stands: inputs cannot be trusted, or it has tried in vain
     FINISHED = "finished"  #: it stands at the end of the skill
 
     @property
@@ -217,6 +218,8 @@ def statuses(
     held: Sequence[tuple[Flags | None, str]],
     halted: Flags | None,
     inputs: Inputs | None,
+    gates: Gates | None = None,
+    obstructed: Mapping[int, tuple[bool, str]] = MappingProxyType({}),
 ) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
     """The status of each robot, and why one does not simply run.
 
@@ -237,14 +240,20 @@ def statuses(
         Robots without accepted inputs.
     inputs : Inputs, optional
         Why that is so.
+    gates : Gates, optional
+        What robots wait for at the end of a skill.
+    obstructed : mapping of int to (bool, str)
+        Robots that obstacles keep off: whether time waits for them, and why.
     """
-    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    codes, texts = _at_gates(progress, gates)
     if progress.waits.any():
-        texts = _waiting(progress, names, wanted, inputs)
+        texts |= _waiting(progress, names, wanted, inputs)
         codes[progress.waits] = Status.WAITING.code
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
     if ended is not None:
         codes[ended] = Status.FINISHED.code
+    for row, (waits, reason) in obstructed.items():
+        codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
     for robots, reason in held:
         if robots is not None:
             codes[robots] = Status.HOLDING.code
@@ -255,6 +264,18 @@ def statuses(
         codes[halted] = Status.HOLDING.code
         reasons |= inputs.reasons(halted.reshape(tuple(batch)))
     return codes, reasons or _NO_REASONS
+
+
+def _at_gates(
+    progress: Progress, gates: Gates | None
+) -> tuple[NDArray[np.int8], dict[int, str]]:
+    """The status of robots that stand at the end of a skill of a sequence, and why."""
+    codes = np.zeros(len(progress.time), np.int8)
+    if gates is None or not gates.reasons:
+        return codes, {}
+    codes[list(gates.reasons)] = Status.WAITING.code
+    codes[gates.failed] = Status.HOLDING.code
+    return codes, dict(gates.reasons)
 
 
 def _waiting(

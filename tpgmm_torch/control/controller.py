@@ -8,14 +8,21 @@ sense
 locate
     each robot's time in the skill, and whether it follows (:mod:`~tpgmm_torch.control.locate`,
     :mod:`~tpgmm_torch.sensing.servo`, :mod:`~tpgmm_torch.control.places`)
+gate
+    robots that wait until a skill of a sequence may begin, or go back
+    (:mod:`~tpgmm_torch.control.gates`)
 hold
     objects that move with a hand (:mod:`~tpgmm_torch.control.hold`)
+touch
+    links that move by the error of their forces (:mod:`~tpgmm_torch.contact.admittance`)
 estimate
     the Gaussian of the joints (:mod:`~tpgmm_torch.control.estimate`)
 reach
     the posture that is wanted (:mod:`~tpgmm_torch.control.reach`)
 follow
     the next reference, within bounds (:mod:`~tpgmm_torch.motion.follow`)
+avoid
+    references that keep clear of obstacles (:mod:`~tpgmm_torch.obstacles.avoid`)
 command
     what is sent, and the status in words (:mod:`~tpgmm_torch.control.command`)
 
@@ -46,16 +53,17 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import START
+from tpgmm_torch.contact.admittance import Admittance, Offsets
 from tpgmm_torch.control import command as commands
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.control.command import Command
 from tpgmm_torch.control.estimate import choose, estimate
+from tpgmm_torch.control.gates import Gates, Moment
 from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
+from tpgmm_torch.control.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
-from tpgmm_torch.control.situations import completed_frames, report_start
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
@@ -63,12 +71,16 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follow import Following
 from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.obstacles.avoid import Avoidance
+from tpgmm_torch.obstacles.scene import Scene
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.servo import Flags
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.sensing.wrenches import Wrenches
+from tpgmm_torch.skills.situations import completed_frames, report_start
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]
@@ -97,6 +109,8 @@ class _Tick:
         Accepted readings, NaN elsewhere.
     halted : bool array of shape (B,), optional
         Robots without accepted inputs.
+    obstructed : array of shape (B,), optional
+        How much obstacles hold robots up; from 1 on time stands.
     ended : Tensor of bool of shape (...), optional
         Robots that have been at the end of the skill for a tick.
     """
@@ -107,6 +121,7 @@ class _Tick:
     time: Tensor = field(init=False)
     joints: Tensor | None = None
     halted: Flags | None = None
+    obstructed: Array | None = None
     ended: Tensor | None = None
 
 
@@ -146,10 +161,18 @@ class Controller:
         What q_{t-1} is: the last reference, or the measured posture.
     impedance : Impedance, optional
         Stiffness and damping of the commands.
+    admittance : Admittance, optional
+        How references move by the error of forces, where the skill has operators
+        :class:`~tpgmm_torch.operators.Wrench` and steps are given wrenches; None to follow
+        positions alone.
     begin, end : float, optional
         Run a part of the skill [s].
     at_rest : bool
         Whether robots stand when the skill begins; else they move as the skill does.
+    obstacles : Scene, optional
+        What references keep clear of (:class:`~tpgmm_torch.obstacles.scene.Scene`). Time waits
+        for robots that are kept too far off, and before something is taken or put; not with the
+        clock ``"even"``. The command's reason says what is in the way.
 
     Attributes
     ----------
@@ -176,9 +199,11 @@ class Controller:
         blend: float = 1.0,
         feedback: str = "reference",
         impedance: Impedance | None = None,
+        admittance: Admittance | None = Admittance(),  # noqa: B008  (frozen)
         begin: float | None = None,
         end: float | None = None,
         at_rest: bool = True,
+        obstacles: Scene | None = None,
     ) -> None:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
@@ -200,23 +225,28 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
+        self._wrenches, forces = _expected_contacts(skill, start, begin)
+        self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
-        self._limits = None
-        if bounds is not None:  # rounded postures stay within these
-            low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
-            self._limits = low / GRID, high / GRID
+        self._avoidance, batch = None, len(self._progress.time)
+        if obstacles is not None:
+            self._avoidance = Avoidance.start(obstacles, kinematics, bounds, batch)
+        self._limits = _limits(bounds)
         self.command: Command | None = None
 
     def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
         self._places, rows = Places(self._skill, begin, end), _rows(as_array(start))
         time = np.full(len(rows), begin, np.float64)
+        self._gates = Gates.start(self._skill.gates, time, end, self._trusts)
         if clock.kind == "localizing" and clock.initial == "anywhere":
+            before = replace(self._places, end=min(end, float(self._gates.stop[0])))
             for row in range(len(rows)):
-                time[row] = self._places.first(row, self.holding, start)
-        self._progress = Progress.start(clock, time, end, rows)
+                time[row] = before.first(row, self.holding, start)
+        progress = Progress.start(clock, time, end, rows)
+        self._progress = replace(progress, stop=self._gates.stop)
         # robots that begin in the middle of the skill stand where no demonstration starts
         midway = torch.from_numpy(time > begin + START * (end - begin))
         midway = midway.view(start.shape[:-1]).to(start.device)
@@ -225,12 +255,25 @@ class Controller:
     @property
     def reference(self) -> Tensor:
         """The last reference (..., n_joints); the start posture before the first step."""
-        return self._following.reference
+        return self._sent.reference
+
+    @property
+    def _sent(self) -> Following | Follower:
+        """What is sent: the ordinary references, or those that keep clear of obstacles."""
+        sent = None if self._avoidance is None else self._avoidance.sent
+        return self._following if sent is None else sent
 
     @property
     def holding(self) -> Holding:
         """What the robots hold, and where objects were last free."""
         return self._holds.holding
+
+    @property
+    def contacts(self) -> dict[str, Tensor]:
+        """Which robots are in contact (...), by links whose wrench was given."""
+        device = self.reference.device
+        readings = self._wrenches.readings.items()
+        return {link: torch.from_numpy(one.contact).to(device) for link, one in readings}
 
     @property
     def time(self) -> Tensor:
@@ -254,6 +297,7 @@ class Controller:
         *,
         holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
+        wrenches: Mapping[str, Any] | None = None,
     ) -> Command:
         """Find the next reference.
 
@@ -274,6 +318,10 @@ class Controller:
         ages : mapping of str to float, optional
             How old ``"joints"`` and the frames are [s]; infinite for what else holds robots,
             a reason in words.
+        wrenches : mapping of str to array-like of shape (..., 6), optional
+            Measured forces [N] and moments [N m] that links exert, at their origins, in the
+            base frame, without the weight of the tool. One that was given once is expected
+            at each step; while it is missing, or not finite, its link moves no further.
 
         Returns
         -------
@@ -283,22 +331,27 @@ class Controller:
         ------
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
+        UnknownNameError
+            If wrenches are those of links that the robot does not have.
 
         Warns
         -----
         PlausibilityWarning
-            If ``dt`` is more than a second, with ``trust``.
+            With ``trust``, if ``dt`` is more than a second, or the first step has no wrench of
+            a skill that expects forces.
         """
         tick = self._timed(dt)
         if tick is None:
             assert self.command is not None
             self.command = commands.refused(self.command, f"{NOT_INCREASED}: dt = {dt!r}")
             return self.command
-        self._sense(tick, joints, frames, ages)
+        self._sense(tick, joints, frames, self._touched(tick, wrenches, ages))
         self._locate(tick)
+        self._gate(tick)
         tick.time = self.time
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
+            self._touch(tick)
             self._follow(tick, *self._reach(tick, self._estimate(tick)))
         else:
             assert self.command is not None
@@ -369,6 +422,16 @@ class Controller:
             measured = torch.where(self._gripping, torch.nan, measured)
         tick.joints = measured
 
+    def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
+        """Measured wrenches; ages of inputs, with those that are missing too long."""
+        if tick.first and self._trusts and self._offsets is not None and not wrenches:
+            warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
+        self._wrenches = self._wrenches.update(tick.seconds, wrenches)
+        if self._inputs is None:
+            return ages
+        late = self._wrenches.late(self._inputs.trust.joint_timeout)
+        return {**ages, **late} if isinstance(ages, Mapping) and late else late or ages
+
     def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
         assert self._inputs is not None
@@ -398,8 +461,9 @@ class Controller:
         passed = none + np.ravel(tick.seconds)
         held = [robots for robots in (tick.halted, tick.late) if robots is not None]
         still: Flags = np.logical_or.reduce([none, *held])
+        tick.obstructed = self._obstruction(passed)
         if not self._trusts and tick.joints is None:
-            self._progress = before.even(np.where(still, 0.0, passed))
+            self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
         else:
             reference = _rows(as_array(self.reference))
             known, jumped = tick.joints, none
@@ -407,11 +471,21 @@ class Controller:
             if self._inputs is not None:
                 jumped = self._inputs.jumped.reshape(-1)
                 still = still | self._inputs.jumping.reshape(-1)
-            seen = Seen(passed, readings, jumped, still)
+            seen = Seen(passed, readings, jumped, still, tick.obstructed)
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
         tick.ended = self._tensor(over) if over.any() else None
+
+    def _obstruction(self, passed: Array) -> Array | None:
+        """How much obstacles hold robots up (B,)."""
+        if self._avoidance is None or not self._avoidance.led.any():
+            return None
+        progress = self._progress
+        stops = {*progress.clock.arrivals, progress.end}
+        stops.update(time for hold in self._skill.holds for time in (hold.begin, hold.end))
+        soon = progress.time + CATCH_UP * progress.clock.speed * passed
+        return self._avoidance.obstruction(progress.time, soon, sorted(stops))
 
     def _resume(self, robots: Flags) -> None:
         """Robots go on from where they are: those given, and those at another time."""
@@ -423,8 +497,49 @@ class Controller:
 
     def _find(self, row: int, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""
-        now = float(self._progress.time[row])
-        return self._places.find(row, posture, now, self.holding, self.reference.detach())
+        now, gates = float(self._progress.time[row]), self._gates
+        if gates.failed[row]:
+            return None
+        within = float(gates.since[row]), float(gates.stop[row])
+        like = self.reference.detach()
+        return self._places.find(row, posture, now, self.holding, like, within)
+
+    def _gate(self, tick: _Tick) -> None:
+        """Robots that wait for the end of one skill to be what the next one needs."""
+        if tick.first or (self._gates.index == len(self._gates.gates)).all():
+            return
+        progress, postures = self._progress, self._postures(tick, measured=True)
+        passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
+        ready = progress.mode == RUNNING
+        for robots in (tick.halted, tick.late):
+            ready = ready if robots is None else ready & ~robots
+        moment = None
+        if self._inputs is not None and np.isfinite(self._gates.stop).any():
+            moment = self._moment(tick, postures)
+        self._gates = gates = self._gates.advance(progress.time, passed, ready, moment)
+        self._progress = progress.gated(gates.stop, gates.goto)
+        begin, back = (self._tensor(each) for each in (gates.fade > 0, gates.returned))
+        if begin.any():  # a skill begins with objects where they are now
+            self._holds = self._holds.restarted(begin, postures)
+            self._fade = self._fade.again(begin, self._tensor(gates.fade))
+        if back.any():
+            self._holds = self._holds.released(back, postures, self._frames)
+            self._resume(gates.returned)
+
+    def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
+        """What the conditions of gates are asked of."""
+        reference, velocity = self.reference.detach(), self._following.velocity.detach()
+        readings = torch.nan * reference if tick.joints is None else tick.joints
+        arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
+        arrived = self._tensor(self._progress.arrived(*arrays))
+        none = torch.zeros_like(reference[..., 0], dtype=torch.bool)
+        assert self._inputs is not None
+        unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
+        unseen |= self._inputs.lost
+        return Moment(
+            self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
+            self.holding, self.contacts, arrived,
+        )  # fmt: skip
 
     def _hold(self, tick: _Tick, frames: Any, holds: Any) -> None:
         """What the robots hold."""
@@ -432,9 +547,27 @@ class Controller:
         stands, seconds = self._postures(tick, measured=True), _each(tick.seconds)
         self._holds = self._holds.advance(tick.time, stands, seen, holds, seconds, self._inputs)
 
+    def _touch(self, tick: _Tick) -> None:
+        """How far links are moved by the errors of their forces."""
+        if self._offsets is None or not self._wrenches.readings:
+            return
+        expected, kinematics = self._skill.expected_forces(tick.time), self._skill.kinematics
+        operators, state = (*(one.operator for one in expected), *self._offsets.values), None
+        if any(operator.frame in kinematics.links for operator in operators):
+            state = kinematics.state(self._postures(tick, measured=True))
+        passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
+        passed = passed.expand(self.reference.shape[:-1])
+        for robots in (tick.halted, tick.late):
+            if robots is not None:
+                passed = torch.where(self._tensor(robots), 0.0, passed)
+        self._offsets = self._offsets.advance(
+            expected, self._wrenches, state, self.holding.frames, passed
+        )
+
     def _estimate(self, tick: _Tick) -> Estimate:
         """What the skill says."""
-        at = self._postures(tick, self._feedback == "measured")
+        at: Any = self._postures(tick, self._feedback == "measured")
+        at = self._state(at) if self._is_changed else at
         last = self.command.estimate if self.command is not None and self._trusts else None
         found = estimate(self._skill, tick.time, at, self.holding, self._limits, last)
         self._skill = self._skill.advance(found)
@@ -444,7 +577,7 @@ class Controller:
         """The posture that is wanted, and the follower there, where all robots can follow."""
         seconds = 0.0 if tick.first else _each(tick.seconds)
         shift, self._fade = self._fade.advance(
-            self.reference, found.joints, seconds, tick.first
+            self._following.reference, found.joints, seconds, tick.first
         )
         wanted, fitting = self._rounded(found.joints, shift), None
         if not tick.first:
@@ -470,7 +603,7 @@ class Controller:
         joints, self._search = nearest(
             search, follower, wanted, tick.seconds, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
-            found, self._limits, self._state if self.holding.carries else None,
+            found, self._limits, self._state if self._is_changed else None,
             not self._trusts,
         )  # fmt: skip
         return self._rounded(joints, shift), None
@@ -490,24 +623,42 @@ class Controller:
             None if robots is None else self._tensor(robots)
             for robots in (None if tick.first else tick.halted, tick.late)
         )
+        before = self._following.follower
         self._following = self._following.advance(
             wanted, goal, tick.seconds, halted, late, tick.first, fitting
         )
+        if before is not None and not tick.first:
+            self._avoid(tick, before)
+
+    def _avoid(self, tick: _Tick, before: Follower) -> None:
+        """The references that are sent, clear of obstacles."""
+        after = self._following.follower
+        if self._avoidance is not None and after is not None:
+            none: Flags = np.zeros(len(self._progress.time), bool)
+            state = self._state(self.reference) if self.holding.carries else None
+            self._avoidance = self._avoidance.advance(
+                before, after, state, self.holding.frames,
+                none if tick.halted is None else tick.halted,
+                none if tick.late is None else tick.late,
+            )  # fmt: skip
 
     def _send(self, tick: _Tick) -> Command:
         """The command, with the status of each robot."""
         following, progress = self._following, self._progress
         lost = None if following.lost is None else following.lost.numpy(force=True).reshape(-1)
         ended = None if tick.ended is None else tick.ended.numpy(force=True).reshape(-1)
+        blocked: Mapping[int, tuple[bool, str]] = {}
+        if tick.obstructed is not None and self._avoidance is not None:
+            blocked = self._avoidance.reasons(tick.obstructed)
         codes, reasons = commands.statuses(
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
             ((lost, NO_ANSWER), (tick.late, NOT_INCREASED)),
-            tick.halted, self._inputs,
+            tick.halted, self._inputs, self._gates, blocked,
         )  # fmt: skip
         self.command = Command(
-            following.reference,
-            following.velocity,
+            self._sent.reference,
+            self._sent.velocity,
             tick.time,
             self._found,
             self._tensor(codes),
@@ -542,12 +693,20 @@ class Controller:
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
         if not measured or tick.joints is None:
-            return self.reference
+            return self._following.reference
         return torch.where(tick.joints.isnan(), self.reference, tick.joints)
 
+    @property
+    def _is_changed(self) -> bool:
+        """Whether there is more to a state than the kinematics say."""
+        return self.holding.carries or (self._offsets is not None and self._offsets.active)
+
     def _state(self, joints: Tensor) -> RobotState:
-        """With the objects that the robots hold."""
-        return self.holding.state(self._skill.kinematics.state(joints))
+        """With the objects that the robots hold, and the offsets of links in contact."""
+        state = self._skill.kinematics.state(joints)
+        if self._offsets is not None:
+            state = self._offsets.displaced(state, self.holding.frames)
+        return self.holding.state(state)
 
     def _rounded(self, joints: Tensor, shift: Tensor | None) -> Tensor:
         """Wanted postures; where there are bounds, on a grid."""
@@ -576,6 +735,12 @@ LONG_TICK = (
 )
 
 
+NO_WRENCH = (
+    "the skill expects forces, and the first step has no wrench: references follow positions "
+    "alone. Give step(..., wrenches={link: ...}), or Controller(..., admittance=None)"
+)
+
+
 def _novelty(
     summary: Any, start: Tensor, first: Mapping[str, Frame], now: Mapping[str, Frame]
 ) -> Tensor:
@@ -599,6 +764,14 @@ def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
 
 
+def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> tuple[Wrenches, bool]:
+    """Readings of wrenches before the first, and whether the skill expects forces."""
+    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+    thresholds = {operator.link: operator.contact for operator in forces}
+    wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), thresholds)
+    return wrenches, bool(forces)
+
+
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:
     begin = skill.begin if begin is None else begin
     end = skill.end if end is None else end
@@ -618,6 +791,13 @@ def _motion_bounds(
     if isinstance(bounds, str) and bounds != "robot":
         raise DataError(f"bounds are MotionBounds, a mapping, 'robot' or None, got {bounds!r}")
     return skill.motion_bounds
+
+
+def _limits(bounds: MotionBounds | None) -> tuple[Tensor, Tensor] | None:
+    """Between which rounded postures stay."""
+    if bounds is None:
+        return None
+    return (bounds.lower * GRID).ceil() / GRID, (bounds.upper * GRID).floor() / GRID
 
 
 def _durations(dt: Any) -> tuple[Seconds, Flags | None]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import TPGMMError
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["choose", "estimate"]
@@ -19,7 +20,7 @@ __all__ = ["choose", "estimate"]
 def estimate(
     skill: Skill,
     time: Tensor,
-    joints: Tensor,
+    joints: Tensor | RobotState,
     holding: Holding,
     bounds: tuple[Tensor, Tensor] | None,
     last: Estimate | None,
@@ -31,8 +32,8 @@ def estimate(
     skill : Skill
     time : Tensor of shape () or (...)
         [s].
-    joints : Tensor of shape (..., n_joints)
-        The state q_{t-1}.
+    joints : Tensor of shape (..., n_joints), or RobotState
+        The state q_{t-1}, with what the robots hold.
     holding : Holding
         Objects, and which of them the robots hold.
     bounds : tuple of two Tensor of shape (n_joints,), optional
@@ -46,8 +47,8 @@ def estimate(
         As the skill does.
     """
     state: Any = joints
-    if holding.carries:
-        state = holding.state(skill.kinematics.state(joints))
+    if isinstance(joints, RobotState):
+        joints = joints.joints
     try:
         return skill.estimate(time, state, holding.frames, bounds)
     except TPGMMError:

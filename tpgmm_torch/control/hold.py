@@ -310,6 +310,34 @@ class Holds:
         assert inputs is not None
         return replace(new, hidden=new._hidden(joints, lost, inputs, dt))
 
+    def restarted(self, robots: Tensor, joints: Tensor) -> Self:
+        """For some robots a separate skill begins; see :meth:`Holding.restarted`."""
+        return replace(self, holding=self.holding.restarted(robots, joints))
+
+    def released(self, robots: Tensor, joints: Tensor, seen: Mapping[str, Frame]) -> Self:
+        """Some robots do something again: they hold nothing, and objects are where they are.
+
+        Parameters
+        ----------
+        robots : Tensor of bool, of shape (...)
+        joints : Tensor of shape (..., n_joints)
+            Measured postures [rad or m].
+        seen : mapping of str to Frame
+            Where objects are seen, or were seen last.
+        """
+        where = robots.unsqueeze(-1)
+        rests = {
+            name: replace(
+                rest,
+                pose=choose(robots, rest.seen, rest.pose),
+                joints=torch.where(where, joints, rest.joints),
+                away=rest.away.masked_fill(robots, 0.0),
+            )
+            for name, rest in self.watch.rests.items()
+        }
+        holding = self.holding.released(robots, seen)
+        return replace(self, holding=holding, watch=replace(self.watch, rests=rests))
+
     def _hidden(
         self, joints: Tensor, lost: Mapping[str, Tensor], inputs: Inputs, dt: float | Tensor
     ) -> dict[str, Tensor]:

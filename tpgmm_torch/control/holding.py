@@ -278,6 +278,41 @@ class Holding:
         now = replace(before, given=before.given & ~where)
         return replace(self, held={**self.held, name: now})
 
+    def released(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
+        """Some robots hold nothing, and objects are where they are seen.
+
+        From the next tick on the skill says what they hold.
+
+        Parameters
+        ----------
+        robots : Tensor of bool, of shape (...)
+        seen : mapping of str to Frame
+        """
+        frames, held = dict(self.frames), dict(self.held)
+        for name in frames.keys() & seen.keys():
+            frames[name] = choose(robots, seen[name], frames[name])
+        for name, before in held.items():
+            carrier = torch.where(robots, -1, before.carrier)
+            held[name] = replace(before, carrier=carrier, given=before.given & ~robots)
+        return replace(self, frames=frames, held=held)
+
+    def restarted(self, robots: Tensor, joints: Tensor) -> Self:
+        """Objects that some robots hold are, as places, where they are now.
+
+        Parameters
+        ----------
+        robots : Tensor of bool, of shape (...)
+            For which a separate skill begins.
+        joints : Tensor of shape (..., n_joints)
+            Their postures [rad or m].
+        """
+        frames, state = dict(self.frames), self.kinematics.state(joints)
+        for name, held in self.held.items():
+            where = robots & held.is_held
+            if bool(where.any()):
+                frames[name] = choose(where, self.carried(name, state), frames[name])
+        return replace(self, frames=frames)
+
     def carried(self, name: str, state: RobotState) -> Frame:
         """Pose of an object that is or was held, if its link has it still."""
         return self._with(state, name, self.held[name]).pose(name)

@@ -76,12 +76,15 @@ class Seen:
         Robots whose readings have jumped to somewhere else, and stay there.
     halted : bool array of shape (B,)
         Robots for which time stands: nothing can be trusted, or time did not increase.
+    obstructed : array of shape (B,), optional
+        How much obstacles hold robots up: time goes on the slower, and from 1 on stands.
     """
 
     dt: Array
     joints: Array
     jumped: Flags
     halted: Flags
+    obstructed: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +129,8 @@ class Progress:
         tick.
     wanted : array of shape (B, n_joints)
         What the skill wanted last of robots that do not run.
+    stop : array of shape (B,)
+        Time beyond which robots do not go [s].
     """
 
     clock: Clock
@@ -154,6 +159,7 @@ class Progress:
     placed: Flags
     relocalized: Flags
     wanted: Array
+    stop: Array
 
     @classmethod
     def start(cls, clock: Clock, time: Array, end: float, posture: Array) -> Self:
@@ -164,7 +170,7 @@ class Progress:
             clock, end, servo, time, zero + 1, zero, zero,
             zero.astype(int), zero, zero, posture, posture < -np.inf, 0 * posture,
             posture, posture, none, none, both, posture, servo.second, time,
-            zero - np.inf, none, none, none, posture,
+            zero - np.inf, none, none, none, posture, zero + np.inf,
         )  # fmt: skip
 
     @property
@@ -203,9 +209,42 @@ class Progress:
         new = new._compared(seen)._noticed(reference, seen, find)
         return new._probed(reference, seen, find)._released(seen)
 
-    def even(self, dt: float | Array) -> Self:
+    def even(self, dt: float | Array, obstructed: Array | None = None) -> Self:
         """Progress where nothing is measured."""
+        if obstructed is not None and self.clock.kind != "even":
+            dt = dt * np.clip(2 - 2 * obstructed, 0.0, 1.0)
         return changed(self, time=self._until_end(self.clock.speed * dt))
+
+    def arrived(self, reference: Array, velocity: Array, readings: Array) -> Flags:
+        """Robots whose joints are where the reference is, at rest: (B,).
+
+        Parameters
+        ----------
+        reference, velocity : array of shape (B, n_joints)
+            What was sent a tick ago [rad or m, rad/s or m/s].
+        readings : array of shape (B, n_joints)
+            NaN where nothing is measured: there the reference counts.
+        """
+        servo, known = self.servo, np.isfinite(readings)
+        rests = np.abs(servo.reading - servo.near_reading) <= FLOOR / 10 + 2 * np.sqrt(
+            servo.noise
+        )
+        there = np.abs(servo.corrected - reference) <= FLOOR
+        there = (there & rests) | ~known
+        return (there & (np.abs(velocity) <= FLOOR)).all(-1) & (self.mode == RUNNING)
+
+    def gated(self, stop: Array, time: Array) -> Self:
+        """Progress up to other times, of robots that may go on from another time.
+
+        Parameters
+        ----------
+        stop : array of shape (B,)
+            Time beyond which robots do not go [s].
+        time : array of shape (B,)
+            From where they go on; NaN from where they are.
+        """
+        now, rest = (np.where(np.isfinite(time), time, x) for x in (self.time, self.rest_time))
+        return changed(self, stop=stop, time=now, rest_time=rest)
 
     def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
         """Where references go: of robots that run, the wanted postures (B, n_joints).
@@ -236,6 +275,8 @@ class Progress:
         stands = seen.halted | (self.mode != RUNNING)
         waits = self.clock.kind != "even"
         lead = np.where(known, self.servo.lead, 0.0).max(-1)
+        if seen.obstructed is not None:
+            lead = np.maximum(lead, seen.obstructed)
         rate = np.minimum(np.maximum(2 - waits * 2 * np.maximum(excess, lead), 0.0), 1.0)
         if waits:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
@@ -272,7 +313,8 @@ class Progress:
     def _until_end(self, step: float | Array) -> Array:
         """Time after a step; rounding does not cost a last one."""
         time = self.time + step
-        return np.where(time > self.end - 1e-6 * np.asarray(step), self.end, time)
+        time = np.where(time > self.end - 1e-6 * np.asarray(step), self.end, time)
+        return np.minimum(time, self.stop)
 
     def _arrived(self, time: Array, known: Flags) -> Array:
         """Times, at most the next arrival of robots that have not arrived."""

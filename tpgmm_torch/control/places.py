@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -54,7 +55,13 @@ class Places:
         return np.linspace(self.begin, self.end, count, dtype=np.float64)
 
     def find(
-        self, row: int, posture: Array, now: float, holding: Holding, like: Tensor
+        self,
+        row: int,
+        posture: Array,
+        now: float,
+        holding: Holding,
+        like: Tensor,
+        within: tuple[float, float] = (-math.inf, math.inf),
     ) -> float | None:
         """The likeliest time that explains a robot's posture, or None.
 
@@ -69,11 +76,13 @@ class Places:
             Objects of the batch.
         like : Tensor of shape (..., n_joints)
             Postures of the batch.
+        within : tuple of float, optional
+            Between which times it is looked for [s].
         """
-        one = self._robot(row, posture, holding, like)
-        if one is None:
+        one, grid = self._robot(row, posture, holding, like), self.grid
+        grid = grid[(grid >= within[0]) & (grid <= within[1])]
+        if one is None or not len(grid):
             return None
-        grid = self.grid
         likelihood = one.log_likelihood(grid)
         apart = grid - now
         distance = np.maximum(2 * apart, -apart)

@@ -30,7 +30,8 @@ class Fade:
         The longest that it takes [s]; 0 for none.
     gap : Tensor of shape (..., n_joints)
     passed, duration : Tensor of shape (...)
-        Time since it began, negative before the gap is known, and how long it takes [s].
+        Time since it began, negative before the gap is known, and how long it takes, at most
+        as long as the gap is not known [s].
     over : bool
         Whether nothing is left, for all robots.
     """
@@ -45,13 +46,27 @@ class Fade:
     def start(cls, joints: Tensor, blend: float) -> Self:
         """For robots that begin in postures (..., n_joints)."""
         zero = torch.zeros_like(joints[..., 0])
-        return cls(blend, torch.zeros_like(joints), zero - 1, zero + blend, blend <= 0)
+        passed = zero - 1 if blend > 0 else zero + torch.inf
+        return cls(blend, torch.zeros_like(joints), passed, zero + blend, blend <= 0)
 
-    def again(self, robots: Tensor) -> Self:
-        """Some robots (...) go on from where their references are."""
-        if self.blend <= 0:
+    def again(self, robots: Tensor, longest: float | Tensor | None = None) -> Self:
+        """Some robots (...) go on from where their references are.
+
+        Parameters
+        ----------
+        robots : Tensor of bool of shape (...)
+        longest : float or Tensor of shape (...), optional
+            The longest that it takes [s], by default ``blend``.
+        """
+        if longest is None and self.blend <= 0:
             return self
-        return replace(self, passed=torch.where(robots, -1.0, self.passed), over=False)
+        longest = torch.as_tensor(self.blend if longest is None else longest).to(self.passed)
+        return replace(
+            self,
+            passed=torch.where(robots, -1.0, self.passed),
+            duration=torch.where(robots, longest, self.duration),
+            over=False,
+        )
 
     def advance(
         self, reference: Tensor, estimate: Tensor, dt: float | Tensor, first: bool
@@ -75,7 +90,7 @@ class Fade:
                 fresh.unsqueeze(-1), (reference - estimate).nan_to_num(0.0), self.gap
             )
             if not first:
-                duration = torch.where(fresh, fading_time(gap, self.blend), duration)
+                duration = torch.where(fresh, fading_time(gap, duration), duration)
         passed = torch.where(fresh, 0.0, self.passed + dt)
         left = 1 - minimum_jerk(passed / duration)
         over = not bool((left > 0).any())

@@ -14,7 +14,6 @@ from sklearn.utils import check_random_state
 from tpgmm_torch import gaussians
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.situations import completed_situations, with_novelty
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
@@ -22,6 +21,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import PART
+from tpgmm_torch.skills.situations import completed_situations, with_novelty
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 

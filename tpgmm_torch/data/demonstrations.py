@@ -61,6 +61,20 @@ def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> d
     return frames
 
 
+def _checked_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
+    """Wrenches by link, each (T, 6)."""
+    checked = {}
+    for link, values in dict(wrenches).items():
+        wrench = as_tensor(values, f"the wrench of {link!r}")
+        if wrench.shape != (length, 6):
+            raise ShapeError(
+                f"the wrench of {link!r} has shape ({length}, 6), forces [N] before moments "
+                f"[N m] at each time step, got {tuple(wrench.shape)}"
+            )
+        checked[str(link)] = wrench
+    return checked
+
+
 def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
     names = None if names is None else tuple(names)
     if names is not None and not len(set(names)) == len(names) == count:
@@ -89,6 +103,10 @@ class Demonstration:
     holds : sequence of Hold, optional
         From when to when the robot holds which object, see
         :func:`~tpgmm_torch.attach_holds`; empty if it holds none, None if that is not known.
+    wrenches : mapping of str to array-like of shape (T, 6), optional
+        By link, the forces [N] and then the moments [N m] that the robot exerts on its
+        surroundings there: at the link's origin, in the axes of the base frame, without the
+        weight of the tool.
 
     Raises
     ------
@@ -115,6 +133,7 @@ class Demonstration:
     joint_names: tuple[str, ...] | None = None
     events: Mapping[str, float] = field(default_factory=dict)
     holds: tuple[Hold, ...] | None = None
+    wrenches: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         time = _checked_time(self.time)
@@ -135,7 +154,8 @@ class Demonstration:
         frames = _checked_frames(self.frames, len(time))
         holds = None if self.holds is None else check_holds(self.holds, frames)
         vars(self).update(time=time, joints=joints, frames=frames, joint_names=names)
-        vars(self).update(events=events, holds=holds)
+        wrenches = _checked_wrenches(self.wrenches, len(time))
+        vars(self).update(events=events, holds=holds, wrenches=wrenches)
 
     def __len__(self) -> int:
         """Number of time steps T."""
@@ -193,6 +213,7 @@ class Demonstration:
             joints=self.joints[chosen],
             frames={n: f[chosen] if f.batch_shape else f for n, f in self.frames.items()},
             events={name: at for name, at in self.events.items() if begin <= at <= end},
+            wrenches={link: wrench[chosen] for link, wrench in self.wrenches.items()},
         )
 
     def reordered(self, joint_names: Sequence[str]) -> Demonstration:
@@ -414,8 +435,7 @@ def _check_alike(
         raise DataError(
             f"demonstration {index} has joint_names {item.joint_names}, another {names}"
         )
-    if set(item.frames) != set(first.frames):
-        raise DataError(
-            f"demonstration {index} has frames {sorted(item.frames)}, the first has "
-            f"{sorted(first.frames)}"
-        )
+    for what in ("frames", "wrenches"):
+        own, others = sorted(getattr(item, what)), sorted(getattr(first, what))
+        if own != others:
+            raise DataError(f"demonstration {index} has {what} {own}, the first has {others}")

@@ -133,6 +133,31 @@ class Follower:
         fits = self._fits(self.moment.taken(as_array(wanted), _column(dt))).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
 
+    def braked(self, beside: Self) -> Self:
+        """The next references if all joints come to rest, in a tick as long as ``beside``."""
+        dt = beside.moment.dt
+        seconds = dt[..., 0] if isinstance(dt, np.ndarray) and dt.ndim else dt
+        return self.advance(torch.full_like(self.reference, torch.nan), seconds)
+
+    def redirected(self, before: Self, motion: Array, robots: Mask) -> Self:
+        """The same tick, in which some robots move otherwise; they go on from there.
+
+        Parameters
+        ----------
+        before : Follower
+            At the end of the tick before.
+        motion : ndarray of shape (3, ..., n_joints)
+            Position, velocity and acceleration at the end, which have to be within reach, as
+            those of :class:`~tpgmm_torch.motion.braking.Braking` are.
+        robots : ndarray of bool, of shape (...)
+            Which ones.
+        """
+        where = robots[..., None]
+        moment = before.moment.redirected(self.moment, motion).choose(where, self.moment)
+        reached = torch.from_numpy(np.asarray(moment.motion[0])).to(self.reference)
+        reference = torch.where(torch.from_numpy(where), reached, self.reference)
+        return replace(self, reference=reference, moment=moment)
+
     def _fits(self, exact: Moment) -> Mask:
         """Joints of which that may be the next moment; no reference leaves the limits."""
         limits, position = self.bounds.arrays, exact.motion[0]
@@ -217,6 +242,12 @@ class Moment(NamedTuple):
             drift = (position - self.wanted) / dt
         none = np.zeros_like(self.behind)
         return type(self)(motion, slope, bend, position, drift, none, dt, before)
+
+    def redirected(self, ordinary: Self, motion: Array) -> Self:
+        """The next moment as it is in another motion (3, ..., n_joints)."""
+        slope, bend = self._differences(motion[0], ordinary.dt, ordinary.dt_before)
+        behind = motion[0] != ordinary.wanted
+        return ordinary._replace(motion=motion, slope=slope, bend=bend, behind=behind)
 
     def _differences(self, position: Array, dt: Seconds, last: Seconds) -> tuple[Array, Array]:
         slope = (position - self.motion[0]) / dt

@@ -1,5 +1,6 @@
 """Going from one value to another as smoothly as can be."""
 
+import torch
 from torch import Tensor
 
 __all__ = ["fading_time", "minimum_jerk"]
@@ -27,7 +28,7 @@ def minimum_jerk(fraction: Tensor) -> Tensor:
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
-def fading_time(gap: Tensor, blend: float) -> Tensor:
+def fading_time(gap: Tensor, blend: float | Tensor) -> Tensor:
     """Seconds in which the gap of robots that go on fades, shape (...).
 
     A robot that was held stands a few milliradians from its reference: where it presses on
@@ -37,7 +38,8 @@ def fading_time(gap: Tensor, blend: float) -> Tensor:
     ----------
     gap : Tensor
         From the reference, shape (..., n) [rad or m].
-    blend : float
+    blend : float or Tensor of shape (...)
         The longest that it takes [s]; a tenth of it is the shortest.
     """
-    return (gap.abs().amax(-1) / FADING).clamp(SHORTEST * blend, blend)
+    longest = torch.as_tensor(blend).to(gap)
+    return (gap.abs().amax(-1) / FADING).clamp(SHORTEST * longest, longest)

@@ -21,7 +21,7 @@ from ruckig import (
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.motion.motion_bounds import ENDLESS
 
-__all__ = ["first_part", "stopping_range"]
+__all__ = ["first_part", "rest_positions", "stopping_range"]
 
 
 def first_part(start: Array, target: Array, drift: Array, dt: Array, limits: Array) -> Array:
@@ -73,13 +73,7 @@ def stopping_range(start: Array, acceleration: Array, jerk: Array) -> tuple[Arra
     high : ndarray of shape (N,)
         Infinite if no plan is found.
     """
-    position = start[0]
-    at_once = np.isinf(acceleration) & np.isinf(jerk)
-    asked = _input(np.where(at_once, [position, 0 * position, 0 * position], start))
-    asked.max_acceleration = np.minimum(acceleration, ENDLESS).tolist()
-    asked.max_jerk = jerk.tolist()
-    asked.control_interface = ControlInterface.Velocity
-    plan = _plan(asked)
+    position, plan = start[0], _stop(start, acceleration, jerk)
     if plan is None:
         unknown = np.full_like(position, np.inf)
         return -unknown, unknown
@@ -87,6 +81,37 @@ def stopping_range(start: Array, acceleration: Array, jerk: Array) -> tuple[Arra
     moves = np.array(plan.independent_min_durations) > 0  # 0 for the others
     low, high = np.where(moves, extrema, position)
     return low, high
+
+
+def rest_positions(start: Array, acceleration: Array, jerk: Array) -> Array:
+    """Where motions come to rest that stop as soon as they can.
+
+    Parameters
+    ----------
+    start : ndarray of shape (3, N)
+    acceleration, jerk : ndarray of shape (N,)
+        Bounds; they may be infinite.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        Where they are, if no plan is found.
+    """
+    plan = _stop(start, acceleration, jerk)
+    if plan is None:
+        return start[0]
+    found: Array = np.array(plan.at_time(plan.duration)[0])
+    return found
+
+
+def _stop(start: Array, acceleration: Array, jerk: Array) -> Trajectory | None:
+    """The plan of motions to rest."""
+    position, at_once = start[0], np.isinf(acceleration) & np.isinf(jerk)
+    asked = _input(np.where(at_once, [position, 0 * position, 0 * position], start))
+    asked.max_acceleration = np.minimum(acceleration, ENDLESS).tolist()
+    asked.max_jerk = jerk.tolist()
+    asked.control_interface = ControlInterface.Velocity
+    return _plan(asked)
 
 
 def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array) -> Array:

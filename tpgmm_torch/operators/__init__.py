@@ -6,6 +6,7 @@ from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrien
 from tpgmm_torch.operators.pose import PoseOperator
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import Stack
+from tpgmm_torch.operators.wrench import Wrench
 
 __all__ = [
     "AbsoluteOrientation",
@@ -17,4 +18,5 @@ __all__ = [
     "RelativeOrientation",
     "RelativePosition",
     "Stack",
+    "Wrench",
 ]

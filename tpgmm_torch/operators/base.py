@@ -14,7 +14,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "carried_objects", "frame_names"]
+__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "of_joints"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +132,11 @@ class Operator(ABC):
         return ()
 
     @property
+    def constrains_joints(self) -> bool:
+        """Whether it has rows in joint space; those of forces have none."""
+        return True
+
+    @property
     def determines_joints(self) -> bool:
         """Whether ``J`` has full column rank, so that this operator alone fixes every joint."""
         return False
@@ -202,6 +207,11 @@ class Operator(ABC):
         for name in {*self.links(), *self.references()} & {*frames} & {*kinematics.links}:
             where = "the demonstration alone, it is a link of the robot too: rename the frame"
             raise UnknownNameError("frame", name, where, frames)
+
+
+def of_joints(operators: Sequence[Operator]) -> tuple[Operator, ...]:
+    """Those ``operators`` that have rows in joint space: the first ones."""
+    return tuple(operator for operator in operators if operator.constrains_joints)
 
 
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:

@@ -6,7 +6,8 @@
 is where a carried bottle is on a tray, ``canonical`` the joints themselves, and
 ``canonical:left_*,waist`` some of them. ``~`` and a number behind a term is its tolerance,
 ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad]. Orientations in tangent space
-are ``orientation[tangent]:l_hand@bottle`` and ``pose[tangent]:l_hand@bottle``.
+are ``orientation[tangent]:l_hand@bottle`` and ``pose[tangent]:l_hand@bottle``. Forces are
+``wrench:r_hand@board``, with the axes that count ``wrench[z]:r_hand@board``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import POSE_OPERATORS, Stack
+from tpgmm_torch.operators.wrench import Wrench
 
 __all__ = ["default_operators", "format_operator", "parse_operator"]
 
@@ -32,13 +34,18 @@ TERM = re.compile(
 )
 #: What ``pose`` is short for.
 PAIR = re.compile(r"position:([^\s~]+) \+ orientation(\[tangent\])?:\1(?= |$)")
+FORCE = re.compile(
+    r"wrench(\[(?P<axes>x?y?z?)\])?:(?P<link>[^\s:@+~]+)@(?P<frame>[^\s:@+~]+)"
+    r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
+)
 GRAMMAR = (
     "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
     "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
     "behind it if seen from a frame or another link, '@held:FRAME' if from an object as the "
     "robot carries it (LINK may be an object too), and '[tangent]' before the colon if "
     "orientations are rotation vectors, all but 'pose' perhaps with a tolerance, '~NUMBER', "
-    "behind it; '+' stacks them, as in 'position:l_hand@bottle + orientation:l_hand@bottle'"
+    "behind it; '+' stacks them, as in 'position:l_hand@bottle + orientation:l_hand@bottle'. "
+    "'wrench:LINK@FRAME' stands alone, or 'wrench[z]:LINK@FRAME' with the axes that count"
 )
 
 
@@ -67,6 +74,8 @@ def parse_operator(text: str) -> Operator:
 
 
 def _term(term: str, text: str) -> list[Operator]:
+    if force := FORCE.fullmatch(term):
+        return [_force(force)]
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
@@ -93,6 +102,21 @@ def _term(term: str, text: str) -> list[Operator]:
     return {"position": [one], "orientation": [other], "pose": [one, other]}[kind.split("[")[0]]
 
 
+def _force(match: re.Match[str]) -> Wrench:
+    axes = None if match["axes"] is None else tuple(map("xyz".index, match["axes"]))
+    given = {} if match["tolerance"] is None else {"tolerance": float(match["tolerance"])}
+    return Wrench(match["link"], match["frame"], axes, **given)
+
+
+def _joints_text(one: Any) -> str:
+    return "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+
+
+def _force_text(one: Any) -> str:
+    axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
+    return f"wrench{axes}:{one.link}@{one.frame}"
+
+
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
     """All ``links`` seen from all ``frames`` (or from the base) as one stack; the joints."""
     references = [f"@{name}" for name in frames] or [""]
@@ -108,7 +132,7 @@ def format_operator(operator: Operator) -> str:
     ----------
     operator : Operator
         Operators that have no such text, like a user's own, are given by their ``repr``. The
-        gain and the path of orientations are left out.
+        gain and the path of orientations, and the threshold of contact, are left out.
 
     Examples
     --------
@@ -121,8 +145,9 @@ def format_operator(operator: Operator) -> str:
         terms = " + ".join(map(format_operator, operator.operators))
         return PAIR.sub(r"pose\2:\1", terms)
     one: Any = operator
-    if type(operator) is Canonical:
-        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+    writer = {Canonical: _joints_text, Wrench: _force_text}.get(type(operator))
+    if writer is not None:
+        text = writer(one)
     elif type(operator) in POSE_OPERATORS:
         kind = "position" if one.gain is None else "orientation"
         tangent = "[tangent]" if operator.rotation_vector_starts(None) else ""

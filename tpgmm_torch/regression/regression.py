@@ -25,8 +25,9 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
-from tpgmm_torch.operators.base import carried_objects, frame_names
+from tpgmm_torch.operators.base import carried_objects, frame_names, of_joints
 from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import (
     ActiveComponents,
     Conditionals,
@@ -230,6 +231,21 @@ class Regression:
         """Mixing weights h_i (..., K) at times of shape (...)."""
         return torch.softmax(self.marginals.log_activation(time.unsqueeze(-1)), -1)
 
+    def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
+        """Of each :class:`Wrench` at times (...); see :meth:`Skill.expected_forces`."""
+        first, found = len(of_joints(self.operators)), []
+        pairs = zip(self.operators[first:], self.conditionals[first:], strict=True)
+        for operator, one in pairs:
+            assert isinstance(operator, Wrench)
+            mean, covariance = gaussians.moment_match(
+                self.weights_at(time), one.at(time), one.covariance
+            )
+            share = mean[..., -1].clamp(0.0, 1.0)
+            found.append(
+                ExpectedForce(operator, mean[..., :-1], covariance[..., :-1, :-1], share)
+            )
+        return tuple(found)
+
     def log_likelihood(
         self,
         times: Tensor,
@@ -240,7 +256,8 @@ class Regression:
         """Log-density of observed robots at times; see :meth:`Skill.log_likelihood`."""
         key = times.numpy(force=True).tobytes()
         if key not in self._likelihoods:
-            parts = self.kinematics, self.operators, self.conditionals, self.marginals
+            own = of_joints(self.operators)
+            parts = self.kinematics, own, self.conditionals[: len(own)], self.marginals
             with torch.inference_mode(False):
                 self._likelihoods[key] = TimeLikelihood(*parts, times)
         with torch.inference_mode():
@@ -253,17 +270,15 @@ class Regression:
         """
         if names in self._observed:
             return self._observed[names]
-        every = [
-            self._part(operator, one, names)
-            for operator, one in zip(self.operators, self.conditionals, strict=True)
-        ]
-        kept = [index for index, part in enumerate(every) if part is not None]
-        parts = [part for part in every if part is not None]
+        pairs = zip(self.operators, self.conditionals, strict=True)
+        every = enumerate(self._part(operator, one, names) for operator, one in pairs)
+        kept = {index: part for index, part in every if part is not None}
+        operators = tuple(operator for operator, _ in kept.values())
         found: Regression | None = None
-        if [operator for operator, _ in parts] == list(self.operators):
+        if list(operators) == list(self.operators):
             found = self
-        elif parts:
-            operators, conditionals = zip(*parts, strict=True)
+        elif of_joints(operators):
+            _, conditionals = zip(*kept.values(), strict=True)
             fusion = self.fusion
             if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
                 fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
@@ -304,7 +319,8 @@ class Regression:
 
     @cached_property
     def _search(self) -> PostureSearch:
-        terms = [Residual.of(operator, self.kinematics) for operator in self.operators]
+        own = of_joints(self.operators)
+        terms = [Residual.of(operator, self.kinematics) for operator in own]
         return PostureSearch(self.kinematics, terms, self.fused, self.free_precision)
 
     def log_density(
@@ -316,7 +332,7 @@ class Regression:
         ----------
         time : Tensor of shape (T,)
         local : sequence of Tensor of shape (T, D_j)
-            Local coordinates of each operator.
+            Local coordinates of each operator, or of the first ones.
         n_samples : float, optional
             Of a component: Student's t in place of the normal law N(X_t^(j) | t, i), see
             :meth:`Conditionals.log_density`.
@@ -326,7 +342,7 @@ class Regression:
         Tensor of shape (T,)
         """
         total = self.marginals.log_activation(time.unsqueeze(-1)) - 0.5 * math.log(2 * math.pi)
-        for one, coordinates in zip(self.conditionals, local, strict=True):
+        for one, coordinates in zip(self.conditionals, local, strict=False):
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
@@ -346,7 +362,7 @@ class Regression:
         state, batch = self.kinematics.state(joints), joints.shape[:-1]
         times = time.expand(batch).flatten()
         local, expected = [], []
-        for j, operator in enumerate(self.operators):
+        for j, operator in enumerate(of_joints(self.operators)):
             rows = operator.at(time).coordinates(state, frames)
             rows = rows.expand(*batch, -1).reshape(len(times), -1)
             wanted = self.expected(j, times)
@@ -359,13 +375,14 @@ class Regression:
     def candidates(
         self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
     ) -> tuple[Candidate, ...]:
-        """Eq. (1) for each operator, mixed over the components, and each one's share.
+        """Eq. (1) for each operator of joints, mixed over the components, and its share.
 
         ``estimate`` is that of ``time`` and the state q_{t-1}.
         """
         index = self._components_at(time).index
         weights = estimate.activation[..., index]
-        conditionals = [one.select(index) for one in self.conditionals]
+        own = self.conditionals[: len(of_joints(self.operators))]
+        conditionals = [one.select(index) for one in own]
         means, covariances = [], []
         for at, mean, _, covariance in self._local(conditionals, time, state, frames):
             # mixing commutes with the affine map, and is less work before it
@@ -395,14 +412,16 @@ class Regression:
         where the joints are then depends on the situation, and few of them show too little of
         it: where a new one is turned otherwise, joints would hold the hands back.
         """
-        priorities = self.fusion.priorities or [0] * len(self.operators)
+        operators = of_joints(self.operators)
+        priorities = self.fusion.priorities or [0] * len(operators)
         levels = sorted(set(priorities))
-        alone = all(isinstance(leaf, Canonical) for leaf in leaves(self.operators))
+        alone = all(isinstance(leaf, Canonical) for leaf in leaves(operators))
         wider = 1.0 if alone else math.sqrt(predictive_scale(self.n_samples))
         fused = []
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            parts = zip(self.conditionals, self.operators, priorities, strict=True)
+            local = self.conditionals[: len(operators)]
+            parts = zip(local, operators, priorities, strict=True)
             for one, operator, priority in parts:
                 members = leaves([operator])
                 widths = [wider if isinstance(leaf, Canonical) else 1.0 for leaf in members]
@@ -417,22 +436,24 @@ class Regression:
     def _update(self) -> KalmanUpdate | None:
         """The update of a prior over the joints, where that is what is asked for."""
         information = isinstance(self.fusion, InformationFusion)
-        if not information or not KalmanUpdate.serves(self.operators, self.kinematics):
+        operators = of_joints(self.operators)
+        if not information or not KalmanUpdate.serves(operators, self.kinematics):
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return KalmanUpdate(self.kinematics, self.operators, self.fused)
+            return KalmanUpdate(self.kinematics, operators, self.fused)
 
     @cached_property
     def free_precision(self) -> Tensor:
         """Precision (n_joints,) of the prior around q_{t-1}: 0 where operators determine it."""
-        if any(one.determines_joints for one in self.operators):
+        own = of_joints(self.operators)
+        if any(one.determines_joints for one in own):
             return torch.zeros_like(self.kinematics.lower)
         return prior_widths(
             self.fusion.prior_std,
             self.kinematics,
-            self.operators,
-            self.conditionals,
+            own,
+            self.conditionals[: len(own)],
             self.log_weights.exp(),
         ).pow(-2)
 
@@ -445,6 +466,11 @@ class Regression:
     def carried_names(self) -> tuple[str, ...]:
         """See :attr:`Skill.carried_names`."""
         return carried_objects(self.operators, self.kinematics)
+
+    @property
+    def gates(self) -> tuple[()]:
+        """See :attr:`Skill.gates`."""
+        return ()
 
     @cached_property
     def _likelihoods(self) -> dict[bytes, TimeLikelihood]:
@@ -590,7 +616,7 @@ class Regression:
 
         Quaternions are on the side of the present ones.
         """
-        for operator, one in zip(self.operators, conditionals, strict=True):
+        for operator, one in zip(of_joints(self.operators), conditionals, strict=True):
             mean, gain, covariance = one.at(time), one.gain, one.covariance
             operator = operator.at(time)
             starts = operator.quaternion_starts(self.kinematics)

@@ -12,7 +12,7 @@ import abc
 import copy
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import torch
@@ -63,6 +63,9 @@ class RobotState:
         robot's link that carries it, -1 where it is free.
     joint_names : tuple of str, default=()
         Of the joints, for operators that look some of them up by name.
+    wrenches : mapping of str to Tensor of shape (..., 6)
+        Forces [N] and moments [N m] that links exert, at their origins, in the base frame;
+        empty where none were measured.
     """
 
     joints: Tensor
@@ -72,6 +75,7 @@ class RobotState:
     jacobians: Tensor
     carriers: tuple[int | Tensor, ...] = ()
     joint_names: tuple[str, ...] = ()
+    wrenches: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         kind = type(self).__name__
@@ -115,6 +119,18 @@ class RobotState:
         index = self._index(link)
         n_robot = len(self.links) - len(self.carriers)
         return index if index < n_robot else self.carriers[index - n_robot]
+
+    def displaced(self, link: str, step: Tensor) -> Self:
+        """The state with a link taken to be elsewhere, with the same orientation and Jacobian.
+
+        Parameters
+        ----------
+        link : str
+        step : Tensor of shape (..., 3)
+            From where it is, in the base frame [m].
+        """
+        one_hot = torch.tensor([[name == link] for name in self.links]).to(self.positions)
+        return replace(self, positions=self.positions + one_hot * step.unsqueeze(-2))
 
     def with_link(
         self, name: str, link: str | None, pose: Frame, where: Tensor | None = None
@@ -209,6 +225,7 @@ class RobotState:
             carriers=tuple(
                 change(one, 0) if isinstance(one, Tensor) else one for one in self.carriers
             ),
+            wrenches={link: change(one, 1) for link, one in self.wrenches.items()},
         )
 
     def flatten(self, batch: torch.Size) -> Self:

@@ -14,9 +14,11 @@ from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.operators.wrench import ExpectedForce
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.gate import Gate
 
 __all__ = ["CompositeSkill", "Skill"]
 
@@ -58,6 +60,11 @@ class Skill(Protocol):
     @property
     def holds(self) -> tuple[Hold, ...]:
         """Intervals in which a link holds an object."""
+        return ()
+
+    @property
+    def gates(self) -> tuple[Gate, ...]:
+        """Times beyond which the skill does not go on until conditions are met, ascending."""
         return ()
 
     @property
@@ -106,6 +113,16 @@ class Skill(Protocol):
             If frames are missing or do not fit the robots, or there is no finite estimate.
         """
         ...
+
+    def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
+        """Forces that links exert at a time; none by default.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+            In the skill, for all robots or of each one [s].
+        """
+        return ()
 
     def log_likelihood(
         self,
@@ -276,6 +293,18 @@ class CompositeSkill(Skill):
         )
         mean, covariance = gaussians.moment_match(shares[..., active], means, covariances)
         return Estimate(mean, covariance, shares, after=after)
+
+    def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
+        """See :meth:`Skill.expected_forces`; of one operator, the mean of the skills."""
+        time = time.to(self.kinematics.lower)
+        shares, found = self.shares(time), dict[Any, ExpectedForce]()
+        for k, skill in enumerate(self.skills):
+            weight = shares[..., k]
+            for one in skill.expected_forces(self.time_of(k, time)):
+                part = one.scaled(weight)
+                before = found.get(one.operator)
+                found[one.operator] = part if before is None else before.plus(part)
+        return tuple(found.values())
 
     def log_likelihood(
         self,

@@ -22,6 +22,7 @@ from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
@@ -104,7 +105,7 @@ def learn(
     where = settings["dtype"], settings["device"]
     kinematics = kinematics_for(head, operators, settings["robot"], *where)
     if settings["fusion"] is not None:
-        settings["fusion"].check(operators, kinematics)
+        settings["fusion"].check(of_joints(operators), kinematics)
     peaks, episodes = DemonstratedPeaks(kinematics.joint_names), list[EpisodeSummary]()
 
     def watched() -> Iterator[Sequence[Demonstration]]:
@@ -174,7 +175,7 @@ def known(
     if robot is None:
         raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
     if settings["fusion"] is not None:
-        settings["fusion"].check(operators, robot)
+        settings["fusion"].check(of_joints(operators), robot)
     mixture = BlockGaussianMixture.from_parameters(
         weights, means, covariances, **_of_mixture(settings, operators, robot)
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -70,6 +70,9 @@ class Motion:
             )
         ordered = demonstration.reordered(kinematics.joint_names)
         state = kinematics.state(ordered.joints)
+        if ordered.wrenches:
+            measured = {link: one.to(state.joints) for link, one in ordered.wrenches.items()}
+            state = replace(state, wrenches=measured)
         frames = {name: frame.to(state.joints) for name, frame in ordered.frames.items()}
         time = ordered.time.to(kinematics.lower)
         if holds:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.row_file import ColumnMoments
-from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators import Canonical, Operator, Wrench
+from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -22,7 +23,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 __all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
 
 #: Of these, equal ones say the same; of a user's own operators nobody knows.
-COMPARED = (Canonical, *POSE_OPERATORS)
+COMPARED = (Canonical, Wrench, *POSE_OPERATORS)
 
 
 def check_operators(operators: Any) -> tuple[Operator, ...]:
@@ -39,11 +40,26 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
     for operator in checked:
         if not isinstance(operator, Operator):
             raise DataError(f"operators holds Operator objects, got {operator!r}")
+    _check_forces(checked)
     known = [leaf for leaf in leaves(checked) if type(leaf) in COMPARED]
     for number, leaf in enumerate(known):
         if leaf in known[:number]:
             raise DataError(f"operators has {leaf!r} twice: it would count twice")
     return checked
+
+
+def _check_forces(checked: tuple[Operator, ...]) -> None:
+    """Refuse forces that do not stand behind what says something of the joints."""
+    joints = of_joints(checked)
+    if (
+        not joints
+        or checked[: len(joints)] != joints
+        or not all(leaf.constrains_joints for leaf in leaves(joints))
+    ):
+        raise DataError(
+            "Wrench() says nothing of the joints: it stands by itself, in no Stack, behind at "
+            f"least one operator that does, got {list(checked)}"
+        )
 
 
 def kinematics_for(

@@ -20,6 +20,7 @@ from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import equivalent_rows
+from tpgmm_torch.training.force_axes import with_force_axes
 from tpgmm_torch.training.hold_detection import demonstrated_holds
 from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, rows_of
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
@@ -201,7 +202,8 @@ def read_rows(
     alone = later is None and processes.count == 1
     holds = processes.gather(demonstrated_holds(head, operators, kinematics))[0]
     motions = [Motion.of(one, kinematics, holds) for one in head]
-    operators = processes.gather(with_mean_orientations(operators, motions, kinematics))[0]
+    completed = with_mean_orientations(with_force_axes(operators, motions), motions, kinematics)
+    operators = processes.gather(completed)[0]
     following = chain.from_iterable(chain([later or ()], walk))
     all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
     each = rows_of(all_motions, operators, kinematics, processes=processes)

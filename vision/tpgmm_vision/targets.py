@@ -89,11 +89,6 @@ class Target:
                 f"a target has tags 0 to {count - 1} of {self.family}, got {list(self.corners)}"
             )
 
-    @property
-    def size(self) -> float:
-        """Edge of the smallest tag's black square [m]."""
-        return min(float(np.linalg.norm(one[1] - one[0])) for one in self.corners.values())
-
 
 def _square(size: float) -> Array:
     """Corners of a tag in its own frame."""

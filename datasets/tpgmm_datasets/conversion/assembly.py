@@ -18,6 +18,7 @@ from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
 from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout
+from tpgmm_datasets.lerobot.wrenches import stored_wrenches, wrench_features
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -184,7 +185,8 @@ class Assembly:
         """What has to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        return [self.joints.feature, *objects, *event_features(self.layout)]
+        wrenches = wrench_features(self.layout)
+        return [self.joints.feature, *objects, *event_features(self.layout), *wrenches]
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
@@ -195,6 +197,7 @@ class Assembly:
             stored_frames(self.layout, self.frames, rows),
             self.joints.names,
             flagged_events(rows),
+            wrenches=stored_wrenches(rows),
         )
         demonstration = self._with_events(demonstration, rows)
         if self.trim is not None:

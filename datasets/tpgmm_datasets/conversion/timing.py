@@ -69,7 +69,11 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     }
     first, last = float(demonstration.time[0]), float(target[-1])
     events = {name: min(at - first, last) for name, at in demonstration.events.items()}
-    return replace(demonstration, time=target, joints=joints, frames=frames, events=events)
+    wrenches = {link: linear(wrench) for link, wrench in demonstration.wrenches.items()}
+    return replace(
+        demonstration, time=target, joints=joints, frames=frames, events=events,
+        wrenches=wrenches,
+    )  # fmt: skip
 
 
 def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstration:

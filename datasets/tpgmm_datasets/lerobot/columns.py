@@ -8,6 +8,8 @@
 ``tracking.seen``, ``tracking.known``, ``tracking.residual``
     By object: whether its pose was measured in a picture; measured or inferred; how well
     [pixels].
+``observation.wrench.<link>``
+    Forces [N] and moments [N m] that a link exerts, at its origin, in the base frame.
 ``event.<name>``
     True at the one step nearest to the event.
 ``action``
@@ -47,7 +49,9 @@ Array = np.ndarray[Any, Any]
 Features = dict[str, dict[str, Any]]
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
-EVENT = "event."
+EVENT, WRENCH = "event.", "observation.wrench."
+#: Of the values of a wrench.
+WRENCH_PARTS, WRENCH_UNITS = ("fx", "fy", "fz", "tx", "ty", "tz"), ("N",) * 3 + ("N m",) * 3
 #: Of sets in whose pictures objects were tracked. They do not begin with "observation.": no
 #: policy shall take them for something that it is given.
 SEEN, KNOWN, RESIDUAL = "tracking.seen", "tracking.known", "tracking.residual"
@@ -83,6 +87,8 @@ def features_of(
     features = {STATE: joints}
     if first.frames:
         features[ENVIRONMENT] = with_frames(None, list(first.frames), dtype)
+    for link in first.wrenches:
+        features[WRENCH + link] = _vector(dtype, 6, list(WRENCH_PARTS), WRENCH_UNITS)
     for event in sorted({event for item in demonstrations for event in item.events}):
         if "/" in event or not event:
             raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")
@@ -155,6 +161,8 @@ def demonstration_columns(
         ]
         poses = [pose_values(demonstration.frame(name), steps) for name in order]
         columns[ENVIRONMENT] = np.concatenate(poses, axis=1)
+    for link, wrench in demonstration.wrenches.items():
+        columns[WRENCH + link] = as_array(wrench)
     for key in features:
         if key.startswith(EVENT):
             columns[key] = _flag(demonstration, key.removeprefix(EVENT), fps)

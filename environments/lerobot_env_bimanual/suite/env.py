@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import copy
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Observation
 from lerobot_env_bimanual.bottle.measures import Closing, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import (
@@ -17,6 +20,7 @@ from lerobot_env_bimanual.disturbances import (
     Course,
     Displaced,
     Disturbance,
+    Spoilt,
     StartedMidway,
     displaced,
     parse_condition,
@@ -24,8 +28,9 @@ from lerobot_env_bimanual.disturbances import (
 from lerobot_env_bimanual.robot_scene import add_table
 from lerobot_env_bimanual.start import Start
 from lerobot_env_bimanual.suite.names import UPPER_BODY
-from lerobot_env_bimanual.suite.scene import SuiteScene
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from lerobot_env_bimanual.suite.tasks import suite_task
+from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
@@ -34,6 +39,13 @@ __all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
 GRIP_FORCE = 100.0
 #: A palm that is so near to what it shall hold, and comes no nearer, takes hold of it [m].
 REACH = 0.015
+#: Observed wrenches and their hands, what sensors measure at most, and the standard deviations
+#: of their noise at ``noise=1`` [N, N m].
+WRENCHES = {f"wrench.{hand}": hand for hand in HANDS}
+FORCES = np.array([300.0] * 3 + [30.0] * 3)
+NOISE_WRENCH = np.array([0.15] * 3 + [0.0075] * 3)
+#: How high a thing is lifted when it slips out of a hand [m].
+SLIPS = 0.02
 
 
 def _skips(part: Disturbance) -> bool:
@@ -61,10 +73,15 @@ class SuiteEnv(ControlledEnv):
     Parameters
     ----------
     task : str
-        ``handover``, ``lid``, ``peg_in_hole``, ``pour`` or ``wipe``.
+        ``handover``, ``lid``, ``peg_in_hole``, ``pour``, ``wipe``, or ``pick_place``, of which
+        the conditions ``slips`` and ``knocked`` spoil the first grasp.
     robot : str, default="upper_body"
         The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
         waist and arms of a Unitree G1, 17 joints.
+    force : bool, default=False
+        Whether what hands exert by contact is observed, as ``wrench.l_hand`` and
+        ``wrench.r_hand``: forces [N] and moments [N m] at their origins, in the base frame;
+        with an error of 0.15 N and 7.5 mN m in multiples of ``noise``.
     **options
         Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``mode`` and
         ``track``; an episode takes as long as the slowest demonstration and a second by
@@ -80,7 +97,10 @@ class SuiteEnv(ControlledEnv):
 
     _scene: SuiteScene
 
-    def __init__(self, task: str, robot: str = UPPER_BODY, **options: Any) -> None:
+    def __init__(
+        self, task: str, robot: str = UPPER_BODY, *, force: bool = False, **options: Any
+    ) -> None:
+        self.force = force
         self._task = suite_task(task, robot)
         self.carriers = self._task.carriers  # type: ignore[misc]
         condition = options.get("condition", NOMINAL)
@@ -103,7 +123,17 @@ class SuiteEnv(ControlledEnv):
             track=True,
             **options,
         )
+        if force:
+            every = dict.fromkeys(WRENCHES, spaces.Box(-FORCES, FORCES, dtype=np.float64))
+            self.observation_space = spaces.Dict({**self.observation_space.spaces, **every})
         self.robot, self.task, self.task_description = robot, task, self._task.description
+
+    def _observation(self) -> Observation:
+        seen = super()._observation()
+        for key, hand in WRENCHES.items() if self.force else ():
+            error = self.noise * NOISE_WRENCH * self._felt.standard_normal(6)
+            seen[key] = np.clip(self._scene.wrench(hand) + error, -FORCES, FORCES)
+        return seen
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far; the task says what each figure is."""
@@ -121,7 +151,9 @@ class SuiteEnv(ControlledEnv):
         ).given(options, task.robot)
         first = start.poses[task.objects[0]]
         self._scene.reset(start.poses, start.joints, float(first[2]) - task.foot)
-        self._judge, self._noted = task.judge(), 0.0
+        self._judge, self._noted, self._spoilt = task.judge(), 0.0, False
+        # whether forces are observed changes no other random number
+        self._felt = np.random.default_rng(zlib.crc32(start.joints.tobytes()) + 1)
         self._watch_hands()
         return start
 
@@ -131,9 +163,13 @@ class SuiteEnv(ControlledEnv):
     def _act(self, stopped: bool) -> None:
         scene = self._scene
         if not stopped:
-            for hold, closing in self._closing.items():
-                if hold not in scene.taken and closing.update(self._free, scene.gap(hold)):
+            for hold, closing in tuple(self._closing.items()):
+                gap = scene.gap(hold)
+                if closing.reach < 0 and gap > 2 * REACH:  # it has gone away after it failed
+                    self._closing[hold] = Closing(reach=REACH)
+                elif hold not in scene.taken and closing.update(self._free, gap):
                     scene.hold(hold)
+                self._spoil(hold)
             self._judge.note(scene, self._free - self._noted)
             self._noted = self._free
             for hold in self._judge.lets_go(scene):
@@ -141,6 +177,20 @@ class SuiteEnv(ControlledEnv):
         for hold in tuple(scene.held):
             if scene.pull(hold) > GRIP_FORCE:
                 scene.let_go(hold)
+
+    def _spoil(self, hold: Hold) -> None:
+        """Let the first grasp fail, if that goes wrong in this episode."""
+        scene, first = self._scene, self._task.objects[0]
+        for part in self._drawn:
+            if self._spoilt or hold not in scene.held or not isinstance(part, Spoilt):
+                continue
+            lifted = scene.pose(first)[2] - self._first[2] > SLIPS
+            if hold.thing == first and (lifted or part.step is not None):
+                self._spoilt, self._closing[hold] = True, Closing(reach=-1.0)
+                scene.let_go(hold)
+                scene.taken.discard(hold)
+                if part.step is not None:
+                    self._displace(part.step)
 
     def _usual(self, step: NDArray[np.float64]) -> bool:
         return self._task.usual(displaced(self._first, step))

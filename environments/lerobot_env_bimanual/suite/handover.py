@@ -32,7 +32,7 @@ from lerobot_env_bimanual.suite.task import (
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["Handover"]
+__all__ = ["Handover", "height", "on_stand"]
 
 RADIUS, FOOT = 0.02, 0.08
 LEFT = Hold("l_hand", "baton", "baton")
@@ -67,7 +67,7 @@ class Handover(SuiteTask):
         "stand": flat_at(20, 0.09, 0.001),
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
-    holds = (LEFT, RIGHT)
+    holds: ClassVar[tuple[Hold, ...]] = (LEFT, RIGHT)
     figures: ClassVar = {
         "place_mm": Figure("on the stand [mm]", 1, high=8.0),
         "lean_deg": Figure("lean [deg]", 1, high=5.0),
@@ -135,29 +135,35 @@ class _Judge(Judge):
 
     def note(self, scene: SuiteScene, seconds: float) -> None:
         self.time += seconds
-        self.lifted |= RIGHT in scene.held and self._height(scene) > LIFTED
+        self.lifted |= RIGHT in scene.held and height(scene) > LIFTED
 
     def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
         if LEFT in scene.held and RIGHT in scene.held:
             return (LEFT,)
-        if self.lifted and RIGHT in scene.held:
-            height = max(self._height(scene), 0.0)
-            if self.opening.update(self.time, height):
-                self.put = True
-                return (RIGHT,)
+        near = self.lifted and RIGHT in scene.held
+        if near and self.opening.update(self.time, max(height(scene), 0.0)):
+            self.put = True
+            return (RIGHT,)
         return ()
 
     def figures(self, scene: SuiteScene) -> dict[str, float]:
-        baton, stand = scene.pose("baton"), scene.pose("stand")
-        away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
-        lean = 2 * math.asin(min(1.0, math.hypot(*baton[4:6])))
         return {
-            "place_mm": 1e3 * float(np.linalg.norm(away)),
-            "lean_deg": math.degrees(lean),
+            **on_stand(scene),
             "passed": float(LEFT in scene.taken and RIGHT in scene.taken),
             "put": float(self.put),
         }
 
-    def _height(self, scene: SuiteScene) -> float:
-        """Of the baton's foot above the table [m]."""
-        return float(scene.pose("baton")[2] - FOOT - scene.table)
+
+def on_stand(scene: SuiteScene) -> dict[str, float]:
+    """How far the baton is from its place [mm], and how it leans [deg]."""
+    baton, stand = scene.pose("baton"), scene.pose("stand")
+    away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
+    return {
+        "place_mm": 1e3 * float(np.linalg.norm(away)),
+        "lean_deg": math.degrees(2 * math.asin(min(1.0, math.hypot(*baton[4:6])))),
+    }
+
+
+def height(scene: SuiteScene) -> float:
+    """Of the baton's foot above the table [m]."""
+    return float(scene.pose("baton")[2] - FOOT - scene.table)

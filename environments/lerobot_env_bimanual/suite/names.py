@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["ROBOTS", "SUITE", "UPPER_BODY"]
+__all__ = ["MORE", "ROBOTS", "SUITE", "UPPER_BODY"]
 
 #: Who does the tasks unless another is named.
 UPPER_BODY = "upper_body"
@@ -22,3 +22,5 @@ SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "wipe": ("board",),
     }
 )
+#: The same of tasks that are in no comparison.
+MORE: Mapping[str, tuple[str, ...]] = MappingProxyType({"pick_place": ("baton", "stand")})

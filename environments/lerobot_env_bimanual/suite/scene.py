@@ -194,6 +194,17 @@ class SuiteScene(RobotScene):
                 total += self._contact_force(index, pair == bodies)
         return total
 
+    def wrench(self, body: str) -> NDArray[np.float64]:
+        """What a body does to all it touches, at its origin, shape (6,) [N, N m]."""
+        total, own = np.zeros(6), self.model.body(body).id
+        for index, geoms in enumerate(self.data.contact.geom):
+            first, second = self.model.geom_bodyid[geoms]
+            if first != second and own in (first, second):
+                force = self._contact_force(index, first == own)
+                arm = self.data.contact.pos[index] - self.data.xpos[own]
+                total += np.concatenate((force, np.cross(arm, force)))
+        return total
+
     def snapshot(self) -> tuple[Any, ...]:
         """The state without velocities."""
         model, held, taken = self.model, self.held.copy(), self.taken.copy()

@@ -8,6 +8,7 @@ from lerobot_env_bimanual.suite.handover import Handover
 from lerobot_env_bimanual.suite.lid import Lid
 from lerobot_env_bimanual.suite.names import UPPER_BODY
 from lerobot_env_bimanual.suite.peg_in_hole import PegInHole
+from lerobot_env_bimanual.suite.pick_place import PickPlace
 from lerobot_env_bimanual.suite.pour import Pour
 from lerobot_env_bimanual.suite.robots.embodiments import embodiment
 from lerobot_env_bimanual.suite.task import SuiteTask
@@ -17,7 +18,7 @@ from tpgmm_torch.exceptions import UnknownNameError
 __all__ = ["TASKS", "suite_task"]
 
 TASKS: dict[str, type[SuiteTask]] = {
-    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe)
+    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe, PickPlace)
 }
 
 

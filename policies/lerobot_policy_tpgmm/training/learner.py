@@ -42,7 +42,7 @@ from lerobot_policy_tpgmm.training.losses import (
 from tpgmm_datasets import check
 from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events
-from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_tools.cli.learning import Choices, aligner, learn, prepared
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
@@ -366,6 +366,11 @@ class Learner:
             joints,
             {name: (f if follow else f[0]).to("cpu") for name, f in frames.items()},
             self._kinematics.joint_names,
+            wrenches={
+                key.removeprefix(WRENCH): column.double().cpu()
+                for key, column in columns.items()
+                if key.startswith(WRENCH)
+            },
         )
 
     def _shown(self, rows: Mapping[str, Tensor]) -> Tensor:

@@ -75,7 +75,8 @@ def test_lerobot_makes_each_task(name, robot):
 
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():
-    options = {"task", "robot", *ControlledEnv.__init__.__kwdefaults__} - {"mode", "track"}
+    options = {"task", "robot", "force", *ControlledEnv.__init__.__kwdefaults__}
+    options -= {"mode", "track"}
     config = make_env_config("bimanual", episode_length=9)
     assert set(config.gym_kwargs) == options and config.task == "handover"
     assert SuiteEnv(**config.gym_kwargs).episode_length == 9

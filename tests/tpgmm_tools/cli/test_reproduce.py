@@ -1,12 +1,13 @@
 """``tpgmm reproduce``: the files that it writes."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import torch
 
-from tests.support.command_line import output, refusal
+from tests.support.command_line import output, refusal, run
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_datasets.tables import demonstrations_from_frame, read_table
@@ -72,3 +73,24 @@ def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
     items[1]["frames"] = {"cup": items[1]["frames"]["bottle"]}
     file.write_text(json.dumps(items))
     assert "bottle" in refusal("reproduce", fitted[0], "--situations", file, "--out", out)
+
+
+def test_what_touches_an_obstacle_is_said_with_an_exit_code_of_its_own(
+    dataset, fitted, tmp_path
+):
+    scene, out = tmp_path / "scene.xml", tmp_path / "r.csv"
+    arguments = (
+        "reproduce", fitted[0], "--dataset", dataset, "--episodes", "0", "--out", out,
+        "--obstacles", scene,
+    )  # fmt: skip
+    assert "is an MJCF file" in run(*arguments).stderr
+    box = "<geom name='{}' type='box' size='.2 .5 .1' pos='{}'/>"
+    world = f"<mujoco><worldbody>{box}</worldbody></mujoco>"
+    scene.write_text(world.format("table", "0.4 0 0.05"))
+    assert "visuals=True takes these" in run(*arguments).stderr
+    result = run(*arguments, "--visuals")
+    assert result.exit_code == 3
+    assert "allowed: l_forearm and l_wrist_2 (always overlap" in result.stdout
+    assert re.search(r"   0  [lr]_\w+ \d+ mm inside table at \d\.\d s", result.stdout)
+    scene.write_text(world.format("shelf", "0.4 0 -2"))
+    assert output(*arguments, "--visuals").endswith("nothing touches\n")

@@ -13,6 +13,8 @@ from tests.support.worlds import upper_body
 from tpgmm_tools.viewing import MotionScene, ellipsoids, parse_shape
 from tpgmm_torch import Frame, Hold, Robot, Situation, quaternions
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.obstacles import Scene
+from tpgmm_torch.obstacles import Shape as Solid
 from tpgmm_torch.robots.urdf import read_urdf
 
 
@@ -129,3 +131,21 @@ def test_names_with_a_slash_are_one_step_of_a_path():
     frames = {**situation.frames, "a/b": situation.frames["cup"]}
     drawing = MotionScene(model, fps=5).draw(replace(situation, frames=frames))
     assert "/frames/a_b" in drawing.nodes
+
+
+def test_obstacles_that_stand_still_are_drawn_where_they_are():
+    model, capsule = skills.small_bottle(), ("rod", 0.02, [0.0, 0.0, 0.1], [0.0, 0.0, 0.5])
+    solids = [Solid.table(0.05), Solid.capsule(*capsule), Solid.sphere("ball", 0.1, [1, 2, 3])]
+    world = Scene(model.kinematics_, solids, visuals=True)
+    drawing = MotionScene(model, fps=2.0, obstacles=world).draw(
+        Situation.of(skills.few_bottles()[0])
+    )
+    shown = {n.label: n for path, n in drawing.nodes.items() if path.startswith("/obstacles/")}
+    assert {*shown} == {"table", "rod", "ball"}
+    [top] = shown["table"].solids.values()
+    assert top.kind == "box" and shown["table"].poses[0, 2] + top.size[2] / 2 == 0.05
+    side, *ends = shown["rod"].solids.values()
+    assert side.size == pytest.approx((0.02, 0.4)) and len(ends) == 2
+    assert {round(end.pose[2, 3], 9) for end in ends} == {0.2, -0.2}
+    np.testing.assert_allclose(shown["rod"].poses[0, :3], [0, 0, 0.3], atol=1e-12)
+    assert [one.kind for one in shown["ball"].solids.values()] == ["sphere"]

@@ -5,8 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.support.fetching import skill as of
+from tests.support.fetching import skills
 from tests.support.skills import canonical, handlings, hands_model, wave, waves
-from tpgmm_torch import Canonical, Controller, Frame, SelectOperators, Sequence, rollout
+from tpgmm_torch import (
+    Canonical,
+    Controller,
+    Frame,
+    Hold,
+    SelectOperators,
+    Sequence,
+    rollout,
+)
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.structure.fit_parts import fit_parts
 
@@ -73,6 +83,74 @@ def test_parts_that_do_not_follow_are_refused():
         fit_parts(canonical(n_components=1), shown, [1.0])
     with pytest.raises(DataError, match="operators for 1 of 2 parts"):
         fit_parts(model, shown, [1.0], [[Canonical()]])
-    early, late = fit_parts(model, shown, [1.0]).skills
+    early, _, late = fit_parts(model, shown, [0.7, 1.4]).skills
     with pytest.raises(DataError, match="cannot follow"):
-        Sequence((late, early))
+        Sequence((early, late))
+
+
+def test_skills_that_were_learned_separately_each_keep_their_time():
+    sequence = Sequence((of("pick"), of("place"), of("home")), fade=0.4)
+    assert [gate.time for gate in sequence.gates] == pytest.approx([2.0, 4.4])
+    assert sequence.end == pytest.approx(6.8) and len(sequence.time) == 171
+    assert float(sequence.time.diff().min()) > 0.039  # the seams have time steps too
+    times = torch.tensor([2.0, 2.1, 2.4, 3.4, 4.4, 4.5, 6.8], dtype=torch.float64)
+    assert sequence.leading(times).tolist() == [0, 1, 1, 1, 1, 2, 2]
+    assert sequence.time_of(1, times).tolist() == pytest.approx([0, 0, 0, 1, 2, 2, 2])
+    nested = Sequence((of("home"), sequence), names=("back", "fetch"))
+    assert [gate.time for gate in nested.gates] == pytest.approx([2.0, 5.0, 7.4])
+    parts = fit_parts(canonical(n_components=6), waves(), [1.0])
+    assert parts.gates == () and parts.fade == 0.2
+
+
+def test_what_a_skill_ends_holding_is_held_until_another_lets_go():
+    sequence = Sequence((of("pick"), of("place"), of("home")), fade=0.5)
+    assert sequence.holds == (Hold("cup", "hand", 1.3, 2.5 + 1.3),)
+    unaware = Sequence((of("pick"), of("home"), of("place")), fade=0.5)
+    assert unaware.holds == (Hold("cup", "hand", 1.3, 5.0 + 1.3),)
+    twice = Sequence((of("pick"), of("place"), of("pick")), names="abc", fade=0.5)
+    assert [hold.begin for hold in twice.holds] == pytest.approx([1.3, 5.0 + 1.3])
+
+
+def test_a_line_of_text_is_a_sequence():
+    text = "pick until held+arrived retry 2, home, place until contact:hand retry 1 from pick"
+    sequence = Sequence.parse(text, skills(), timeout=1.5)
+    assert sequence.names == ("pick", "home", "place")
+    assert sequence.until == (("held", "arrived"), (), ("contact:hand",))
+    assert sequence.retry == ((2, 0), (0, 1), (1, 0))
+    last = sequence.gates[-1]
+    assert (last.time, last.back, last.retries, last.timeout) == (sequence.end, 0.0, 1, 1.5)
+    by_path = Sequence.parse("out/pick, out/home", lambda path: of(path.removeprefix("out/")))
+    assert by_path.names == ("pick", "home")
+    for wrong, message in (
+        ("pick if held", "'pick if held' .* is not of the form NAME"),
+        ("pick until holds", "a condition is one of"),
+        ("pick until contact:", "a condition is one of"),
+        ("home until held", "no object is held by the end"),
+        ("pick until free", "no object is free by the end"),
+        ("pick retry 1 from home, home", "from itself or from a skill before it"),
+        ("pick, pick", "2 skills need a name each"),
+    ):
+        with pytest.raises(DataError, match=message):
+            Sequence.parse(wrong, skills())
+    for wrong, message in (
+        ("lift", "'lift'.*pick"),
+        ("pick until contact:foot", "'foot'.*hand"),
+        ("pick retry 1 from lift", "'lift'.*pick"),
+    ):
+        with pytest.raises(UnknownNameError, match=message):
+            Sequence.parse(wrong, skills())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"until": ["held"]}, "until has 1 entries for 2 skills"),
+        ({"until": 3}, "a condition is one of"),
+        ({"retry": [-1, 0]}, "a number of times"),
+        ({"timeout": 0.0}, "a positive fade and timeout"),
+        ({"fade": float("nan")}, "a positive fade and timeout"),
+    ],
+)
+def test_what_makes_no_sequence_is_refused(options, message):
+    with pytest.raises(DataError, match=message):
+        Sequence((of("pick"), of("home")), **options)

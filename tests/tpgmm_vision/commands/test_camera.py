@@ -5,6 +5,7 @@ import tomllib
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 from typer.testing import CliRunner
 
 from tests.support.pdf_pages import pdf_pages
@@ -25,7 +26,8 @@ def test_it_writes_the_pages_and_says_what_the_cell_file_says(tmp_path):
     assert first.startswith(str(out))
     targets = [target_from(json.loads(f"{{{line}}}")["target"]) for line in lines]
     assert [list(one.corners) for one in targets] == [[0], [1], [10, 11, 12, 13, 14]]
-    assert all(abs(one.size - 0.04) < 1e-12 for one in targets)
+    edges = [corners[1] - corners[0] for one in targets for corners in one.corners.values()]
+    np.testing.assert_allclose(np.linalg.norm(edges, axis=1), 0.04)
 
 
 def test_numbers_of_a_cube_that_are_none_are_an_error_of_one_line():

@@ -126,7 +126,17 @@ def test_what_was_never_seen_or_first_seen_late_is_refused():
     noisy, _, hands = carried(0)
     with pytest.raises(DataError, match="never seen"):
         smoothed(noisy, TIME < 0, hands)
-    with pytest.raises(DataError, match=r"first seen 1\.00 s after the start, standing"):
-        smoothed(noisy, TIME >= 1, hands)
+    with pytest.raises(DataError, match=r"first seen 2\.80 s after the start, standing, and a"):
+        smoothed(noisy, TIME >= 2.8, hands)
+    with pytest.raises(DataError, match=r"first seen 1\.00 s after the start, standing, and a"):
+        smoothed(noisy, TIME >= 1, {})  # nobody knows where hands were
     with pytest.raises(DataError, match=r"first seen 4\.00 s after the start, moving"):
         smoothed(noisy, TIME >= 4, hands)
+
+
+def test_what_no_hand_has_touched_stood_where_it_is_first_seen():
+    noisy, true, hands = carried(0)
+    noisy[24:28, 0, 3] += 0.0025  # half hidden still
+    track = smoothed(noisy, TIME >= 24 / FPS, hands)
+    assert track.known.all() and not track.seen[:24].any()
+    assert errors(track, true)[TIME < 2].max() < NOISE

@@ -10,23 +10,15 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tpgmm_tools.cli import dataset, demo, plot, plugins, report, reproduce, view
+from tpgmm_tools.cli import dataset, demo, plot, plugins, report, reproduce, sequence, view
 
 __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
 ORDER = (
-    "demo",
-    "fit",
-    "reproduce",
-    "report",
-    "plot",
-    "view",
-    "app",
-    "dataset",
-    "camera",
+    "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset", "camera",
     "calibrate",
-)
+)  # fmt: skip
 #: Those that are imported when they run, and their line in ``--help``.
 LATE = {
     "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
@@ -132,7 +124,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (demo, plot, report, reproduce, view):
+for module in (demo, plot, report, reproduce, sequence, view):
     app.registered_commands += module.app.registered_commands
 app.add_typer(dataset.app, name="dataset")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -160,7 +161,7 @@ def fit(
         model.operators = operators_or_default(operators, robot, list(first[0].frames))
         kept = prepared(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
-            _echo(_recording_summary(recording, read, kept, described.link))
+            _echo(_recording_summary(recording, read, kept, described.link, not operator))
         episodes = processes.share(kept)
         if batch_episodes is not None:
             batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **about)
@@ -204,7 +205,7 @@ class Aligned:
 
 
 def _recording_summary(
-    recording: Recording, read: Any, kept: Any, named: list[str] | None
+    recording: Recording, read: Any, kept: Any, named: list[str] | None, default: bool
 ) -> dict[str, object]:
     """Summary of the data set and the robot, before anything is learned."""
     assembly, joints = recording.assembly, recording.assembly.joints
@@ -235,7 +236,13 @@ def _recording_summary(
     stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]
     found = [f"{name} (looked for)" for name in assembly.events]
     lines["events"] = ", ".join((*stored, *found))
-    lines["held"] = ", ".join(map(str, kept[0].holds or ()))
+    holds = [
+        str(replace(one, begin=round(one.begin, 2), end=round(one.end, 2)))
+        for one in kept[0].holds or ()
+    ]
+    hint = " (--operator auto, if it counts where that is put)"
+    counts = bool(holds) and default and len(kept[0].frames) > 1
+    lines["held"] = ", ".join(holds) + hint * counts
     return {name: text or "none" for name, text in lines.items()}
 
 

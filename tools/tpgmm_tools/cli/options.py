@@ -19,11 +19,12 @@ from tpgmm_tools.cli.help import HELP_ALL, Command, Help
 if TYPE_CHECKING:
     from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
+    from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
     "Alignments", "DataOptions", "RobotOptions", "align", "command",
-    "options_of", "wanted",
+    "options_of", "scene", "wanted",
 ]  # fmt: skip
 
 #: Options that most people need: a command's ``--help`` lists those of them that it has.
@@ -339,3 +340,18 @@ def align(
         return demonstrations
     aligned: list[Demonstration] = chosen.fit_transform(demonstrations)
     return aligned
+
+
+def scene(
+    file: Path, kinematics: Kinematics, visuals: bool, shown: list[Demonstration]
+) -> Scene:
+    """The robot among the obstacles of a ``file``; what is allowed is listed."""
+    from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.obstacles import Scene
+
+    if not file.is_file():
+        raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
+    scene = Scene(kinematics, file, visuals=visuals).allowing(shown)
+    for (one, other), reason in scene.allowed.items():
+        typer.echo(f"allowed: {one} and {other} ({reason})")
+    return scene

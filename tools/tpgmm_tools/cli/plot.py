@@ -108,6 +108,9 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
         return [names[column] for column in operator.columns(names)]
     if isinstance(operator, kinds.AbsolutePosition | kinds.RelativePosition):
         return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    if isinstance(operator, kinds.Wrench):
+        forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+        return [*forces, f"{operator.link}\ncontact"]
     if operator.rotation_vector_starts(kinematics) == (0,):
         return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
     if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):

@@ -10,7 +10,10 @@ import typer
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
+    from tpgmm_torch.data.frames import Frame
+    from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Trajectory
+    from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["app"]
@@ -18,6 +21,8 @@ __all__ = ["app"]
 app = typer.Typer()
 
 FORMATS = (".parquet", ".csv")
+#: Exit code where something touches an obstacle; errors have 2.
+COLLIDES = 3
 EXAMPLE = (
     "tpgmm reproduce out/model --dataset out/demo/dataset --episodes 0:3 "
     "--out out/reproductions.csv"
@@ -39,6 +44,8 @@ def reproduce(
     via: list[str] | None = None,
     fade: float = 1.0,
     blend: float = 1.0,
+    obstacles: Path | None = None,
+    visuals: bool = False,
 ) -> None:
     """Reproduce a skill in new situations.
 
@@ -63,12 +70,18 @@ def reproduce(
         Seconds before and after a via-point that it changes.
     blend : float >= 0
         Seconds in which the start posture leads into the motion.
+    obstacles : ``FILE.xml``
+        An MJCF with what stands around: says what touches what, from when on and how deep, and
+        ends with exit code 3 if anything does. Pairs that come near each other in the data set,
+        or that an <exclude> names, are allowed, and listed.
+    visuals : bool
+        With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
     from tpgmm_datasets.tables import trajectories_to_frame, write_table
     from tpgmm_torch.control.rollout import rollout
-    from tpgmm_torch.control.situations import at_first
     from tpgmm_torch.exceptions import DataError, UnknownNameError
     from tpgmm_torch.persistence import load_skill
+    from tpgmm_torch.skills.situations import at_first
     from tpgmm_torch.skills.via_points import ViaPoints
     from tpgmm_torch.skills.ways import Ways
 
@@ -78,7 +91,7 @@ def reproduce(
         raise DataError("give either --situations FILE.json or --dataset DATASET")
     skill = load_skill(model, device="cpu")
     kinematics = skill.kinematics
-    wanted, _ = options.wanted(situations, dataset, data, kinematics)
+    wanted, shown = options.wanted(situations, dataset, data, kinematics)
     if via:
         skill = ViaPoints(skill, via, fade)
     try:
@@ -100,6 +113,28 @@ def reproduce(
         [choice] = skill.choose(situation.joints, at_first(situation))
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
+    if obstacles is not None:
+        scene = options.scene(obstacles, kinematics, visuals, shown)
+        pairs = zip(trajectories, wanted, strict=True)
+        if _touches(scene, [(t, s.frames_at(t.time.cpu())) for t, s in pairs], skill.holds):
+            raise typer.Exit(COLLIDES)
+
+
+def _touches(
+    scene: Scene,
+    motions: list[tuple[Trajectory, dict[str, Frame]]],
+    holds: tuple[Hold, ...],
+) -> bool:
+    """Whether anything touches; what does is listed."""
+    from tpgmm_torch.obstacles import find_contacts
+
+    found = [find_contacts(scene, t.time, t.joints, frames, holds) for t, frames in motions]
+    for number, contacts in enumerate(found):
+        for contact in contacts:
+            typer.echo(f"{number:>4}  {contact}")
+    if not any(found):
+        typer.echo("nothing touches")
+    return any(found)
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:

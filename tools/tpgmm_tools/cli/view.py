@@ -35,6 +35,8 @@ def view(
     object_: list[str] | None = None,
     meshes: Path | None = None,
     fps: float = 25.0,
+    obstacles: Path | None = None,
+    visuals: bool = False,
     live: bool = False,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -68,6 +70,11 @@ def view(
         The robot's mesh files; without them, sticks stand for meshes.
     fps : float >= 1
         Pictures per second.
+    obstacles : ``FILE.xml``
+        An MJCF with what stands around, as for 'tpgmm reproduce': it is drawn, and with --live
+        the controller keeps clear of it.
+    visuals : bool
+        With --obstacles, take the robot's visual geometry where it has no collision geometry.
     live : bool
         Serve the page instead: objects can be moved by hand, and the skill is reproduced for
         where they are.
@@ -105,6 +112,8 @@ def view(
     pairs = [text.partition("=") for text in object_ or ()]
     objects = {name: parse_shape(shape) for name, _, shape in pairs}
     how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
+    if obstacles is not None:
+        how["obstacles"] = options.scene(obstacles, fitted.kinematics_, visuals, demonstrations)
     if live:
         at = {"host": host, "port": port, "first": situation, **how}
         with (

@@ -18,6 +18,7 @@ from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -152,7 +153,7 @@ def _influence(skill: Regression) -> str:
         )
         for span in spans
     ]
-    names = (f"`{format_operator(operator)}`" for operator in skill.operators)
+    names = (f"`{format_operator(operator)}`" for operator in of_joints(skill.operators))
     return (
         "The share of each operator in what is known about the joints, their mean, where the "
         "start posture and the objects are in the middle of those shown.\n\n"

@@ -13,6 +13,7 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.impedance.stiffness import Impedance
+from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -142,7 +143,7 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
         title = "stiffness, mean of the joints [N m/rad]"
         top = float(stiffness.max())
         panels.append(Panel(title, time, [Curve("", STIFFNESS, stiffness)], top))
-    decided = zip(model.operators_, trajectory.candidates, strict=True)
+    decided = zip(of_joints(model.operators_), trajectory.candidates, strict=True)
     shares = [
         Curve(format_operator(operator), color, as_array(100 * candidate.share.mean(-1)))
         for (operator, candidate), color in zip(decided, cycle(OPERATORS), strict=False)

@@ -82,7 +82,7 @@ def write_motion(
     title : str, default="tpgmm"
         Of the page.
     **how
-        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
+        ``objects``, ``meshes``, ``fps`` and ``obstacles``, as for :class:`MotionScene`.
 
     Returns
     -------
@@ -296,7 +296,7 @@ class LiveView:
     port : int, default=8080
         The next free one from here on; 0 for any that is free.
     **how
-        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
+        ``objects``, ``meshes``, ``fps`` and ``obstacles``, as for :class:`MotionScene`.
 
     Attributes
     ----------
@@ -399,7 +399,12 @@ class LiveView:
         """Let a controller lead the robot, from the skill's start."""
         with self._lock:
             self.clock, self._posture = 0.0, self.situation.joints
-            self._controller = Controller(self._model.skill, self._posture, self._frames_now())
+            self._controller = Controller(
+                self._model.skill,
+                self._posture,
+                self._frames_now(),
+                obstacles=self._scene.obstacles,
+            )
             self.command, self.statuses, self._run.value = None, [], True
 
     def stop_controller(self) -> None:

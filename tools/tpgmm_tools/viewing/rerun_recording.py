@@ -48,7 +48,7 @@ def write_rerun(
     title : str, default="tpgmm"
         Of the recording.
     **how
-        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
+        ``objects``, ``meshes``, ``fps`` and ``obstacles``, as for :class:`MotionScene`.
 
     Returns
     -------

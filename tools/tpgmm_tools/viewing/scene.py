@@ -21,6 +21,8 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.obstacles import Scene
+from tpgmm_torch.obstacles import Shape as Obstacle
 from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = [
@@ -33,6 +35,9 @@ COLORS: Mapping[str, Color] = {
     "reproduction": (214, 39, 40),
     "covariance": (31, 119, 180),
 }
+OBSTACLE_COLOR: Color = (110, 110, 110)
+#: Obstacles that can be drawn.
+DRAWN = ("box", "sphere", "cylinder", "capsule")
 #: Half axes of the ellipsoids, in standard deviations.
 STANDARD_DEVIATIONS = 2.0
 #: Ellipsoids along a path, and points of a path.
@@ -137,6 +142,8 @@ class MotionScene:
         Folder with the files of the robot's meshes.
     fps : float, default=25.0
         Pictures per second.
+    obstacles : tpgmm_torch.obstacles.Scene, optional
+        Whose boxes, spheres, cylinders and capsules are drawn, as far as they stand still.
 
     Raises
     ------
@@ -149,6 +156,7 @@ class MotionScene:
     objects: Mapping[str, Shape] | None = None
     meshes: Path | None = None
     fps: float = 25.0
+    obstacles: Scene | None = None
     _size: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
@@ -200,7 +208,7 @@ class MotionScene:
         return Drawing(
             trajectory,
             as_array(time)[steps] - float(time[0]),
-            {**dict(self._robot(links)), **dict(self._objects(objects))},
+            dict((*self._robot(links), *self._objects(objects), *self._surroundings())),
             lines,
             where,
             dict(self._demonstrated_frames()),
@@ -232,6 +240,14 @@ class MotionScene:
                 Node(some, {"shape": shape}, 0.09 * self._size, name),
             )
 
+    def _surroundings(self) -> Iterator[tuple[str, Node]]:
+        """Obstacles that stand still."""
+        known = [] if self.obstacles is None else self.obstacles.shapes
+        for number, one in enumerate(known):
+            if one.carrier is None and one.kind in DRAWN:
+                pose = _poses(one.pose.position, one.pose.orientation)[None]
+                yield f"/obstacles/{number}", Node(pose, dict(_drawn(one)), label=one.name)
+
     def _object_poses(
         self, frames: Mapping[str, Frame], state: RobotState, steps: Tensor, time: Tensor
     ) -> Iterator[tuple[str, Array]]:
@@ -259,6 +275,23 @@ class MotionScene:
             first = [frame[0] if frame.batch_shape else frame for frame in frames]
             poses = [_poses(frame.position, frame.orientation) for frame in first]
             yield f"/demonstrations/{_node(name)}", np.stack(poses)
+
+
+def _drawn(one: Obstacle) -> Iterator[tuple[str, Shape]]:
+    """The solids that an obstacle is drawn as."""
+    radius, *lengths = one.size
+    if one.kind == "box":
+        edges = tuple(2 * x for x in one.size)
+        yield "box", Shape("box", edges, np.eye(4), OBSTACLE_COLOR, OBJECT_OPACITY)
+        return
+    half = lengths[0] if lengths else 0.0
+    if half:
+        size = radius, 2 * half
+        yield "side", Shape("cylinder", size, np.eye(4), OBSTACLE_COLOR, OBJECT_OPACITY)
+    for height in {half, -half} if one.kind != "cylinder" else ():
+        pose = np.eye(4)
+        pose[2, 3] = height
+        yield f"end {height}", Shape("sphere", (radius,), pose, OBSTACLE_COLOR, OBJECT_OPACITY)
 
 
 def _steps(time: Tensor, fps: float) -> Tensor:

@@ -33,8 +33,9 @@ REST_TIME, REST_FRAMES, ELSEWHERE = 0.3, 5, 3
 CARRIED_FRAMES, CARRIED_WAY, SLIP = 3, 3.0, 0.01
 #: A gap in a motion that is interpolated, as long as a hand's motion is nearly straight [s].
 SHORT_GAP = 0.2
-#: By when an object must have been seen at rest: a robot hardly reaches it earlier [s].
-LATE = 0.5
+#: An object that is seen later was hidden for long [s]; a hand that was nearer to it before may
+#: have moved it [m].
+LATE, NEAR = 0.5, 0.15
 
 
 class Track:
@@ -102,12 +103,8 @@ class Track:
             self._rest[stretch] = number
             self._fill(stretch, mean)
         self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares[1:] else 0.0
+        self._begin(hands)
         known = np.flatnonzero(self.known)
-        first, still = self.time[known[0]], self._rest[known[0]] >= 0
-        if known[0] > 0 and (first > LATE or not still):
-            how = "standing" if still else "moving"
-            raise DataError(f"it was first seen {first:.2f} s after the start, {how}")
-        self._fill(slice(0, known[0]), self.poses[known[0]])
         for a, b in pairwise(known.tolist()):
             if b > a + 1:
                 self._bridge(a, b, hands)
@@ -118,6 +115,23 @@ class Track:
         count, grasp, hand = max(held, key=lambda one: one[0], default=(0, *self.poses[:2]))
         if count and self._rest[last] < 0:
             self._fill(rest, hand[rest] @ grasp)
+
+    def _begin(self, hands: Mapping[str, Array]) -> None:
+        """Fill the rows before the object was first seen."""
+        first, rests = int(self.known.argmax()), np.flatnonzero(self._rest >= 0)
+        if len(rests):  # some frames before may be worse: seen by one tag, or half covered
+            early = np.flatnonzero(self.known[: rests[0]])
+            away = _points(self.poses[early]) - _points(self.poses[rests[0]])
+            if (np.linalg.norm(away, axis=1) <= self._tolerance).all():
+                self._rest[first : rests[0]] = self._rest[rests[0]]
+                self._fill(slice(first, rests[0]), self.poses[rests[0]])
+        pose, time, still = self.poses[first], self.time[first], self._rest[first] >= 0
+        ways = [hand[: first + 1, :3, 3] - pose[:3, 3] for hand in hands.values()]
+        near = min((float(np.linalg.norm(way, axis=1).min()) for way in ways), default=0.0)
+        if first and not (still and (time <= LATE or near > NEAR)):
+            how = "standing, and a hand may have moved it before" if still else "moving"
+            raise DataError(f"it was first seen {time:.2f} s after the start, {how}")
+        self._fill(slice(0, first), pose)
 
     def _fill(self, rows: slice, poses: Array) -> None:
         self.poses[rows], self.known[rows] = poses, True

@@ -1,0 +1,129 @@
+"""Pick, place, return: three skills that are learned separately, and a grasp that may fail.
+
+The left hand takes a baton, puts it on a stand, and goes back to where it began. Nothing here
+is hard; the conditions ``slips`` and ``knocked`` spoil the first grasp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+
+from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.suite.handover import (
+    BOX,
+    FOOT,
+    LEFT,
+    LIFTED,
+    PUT,
+    Handover,
+    height,
+    on_stand,
+)  # fmt: skip
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
+from lerobot_env_bimanual.suite.task import Box, Judge, Leg, Pose, Style, raised, seen, vector
+from tpgmm_torch import Canonical, Demonstration, Frame
+from tpgmm_torch.operators import Operator
+
+__all__ = ["PickPlace"]
+
+#: Where stands are, in the reach of the left hand [m].
+STANDS = (0.25, -0.04), (0.32, 0.0)
+#: How high the baton is lifted [m].
+LIFT = 0.07
+#: The last phase of each skill.
+SKILLS = {"pick": "lift", "place": "away", "home": "rest"}
+
+
+class PickPlace(Handover):
+    """Take a baton, put it on a stand, and go back, with one hand."""
+
+    name = "pick_place"
+    description = "take the baton with the left hand, put it on the stand, go back"
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.0, "hold": 0.8, "lift": 1.0, "carry": 2.0, "lower": 1.2,
+        "open": 0.8, "away": 1.0, "home": 1.6, "rest": 0.4,
+    }  # fmt: skip
+    holds: ClassVar[tuple[Hold, ...]] = (LEFT,)
+    figures: ClassVar = {
+        **{name: Handover.figures[name] for name in ("place_mm", "lean_deg", "put")},
+        "home_mm": Figure("hand from its start [mm]", 1, high=50.0),
+    }
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
+        """The baton on the left, the stand in the middle of the table."""
+        baton = BOX.draw(rng)
+        low, high = ((*corner, baton[2] - FOOT) for corner in STANDS)
+        return {"baton": baton, "stand": Box(low, high, BOX.yaw).draw(rng)}
+
+    def legs(
+        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
+    ) -> Mapping[str, Sequence[Leg]]:
+        """Left to the baton, up, to the stand, and back; right nowhere."""
+        baton, stand, hand = poses["baton"], poses["stand"], "l_hand"
+        place = Frame(stand.transform(vector((0.0, 0.0, FOOT))), stand.orientation)
+        left = [
+            Leg("reach", self.near(baton, hand, style), free=True),
+            Leg("close", self.at_grip(baton, hand)),
+            Leg("lift", self.at_grip(raised(baton, LIFT), hand)),
+            Leg("carry", self.at_grip(raised(place, LIFT), hand), free=True),
+            Leg("lower", self.at_grip(place, hand)),
+            Leg("away", self.near(place, hand, style)),
+            Leg("home", starts[hand], free=True),
+        ]
+        return {hand: left, "r_hand": []}
+
+    def judge(self) -> Judge:
+        """Opens the hand when the baton is down again."""
+        return _Judge()
+
+    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
+        """The hand seen from where the baton was and from the stand, what it holds; joints."""
+        own = [seen("baton", "stand", orientation, held)] if held else []
+        hand = [seen("l_hand", frame, orientation) for frame in ("baton", "stand")]
+        return [*hand, *own, Canonical()]
+
+    def operators_of(self, skill: str) -> list[Operator]:
+        """The subspaces of ``pick``, ``place`` or ``home``, learned by itself."""
+        pick, *place, joints = self.operators()
+        return {"pick": [pick, joints], "place": [*place, joints]}.get(skill, [joints])
+
+    @staticmethod
+    def parts(recorded: Demonstration) -> dict[str, Demonstration]:
+        """What is recorded of each skill, each on a clock that begins at 0."""
+        ends = [-math.inf, *(recorded.events[last] for last in SKILLS.values())]
+        found = {}
+        for name, (begin, end) in zip(SKILLS, pairwise(ends), strict=True):
+            part = recorded.at_steps((recorded.time > begin) & (recorded.time <= end))
+            time = part.time - part.time[0]
+            found[name] = Demonstration(time, part.joints, part.frames, part.joint_names)
+        return found
+
+
+class _Judge(Judge):
+    def __init__(self) -> None:
+        self.time = 0.0
+        self.lifted = self.put = False
+        self.first: Pose | None = None
+        self.opening = Closing(reach=PUT)
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        self.first = scene.pose("l_hand") if self.first is None else self.first
+        self.time += seconds
+        self.lifted = LEFT in scene.held and (self.lifted or height(scene) > LIFTED)
+
+    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+        if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
+            self.put = True
+            return (LEFT,)
+        return ()
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        hand = scene.pose("l_hand")
+        home = hand - (hand if self.first is None else self.first)
+        placed = {**on_stand(scene), "put": float(self.put)}
+        return {**placed, "home_mm": 1e3 * float(np.linalg.norm(home[:3]))}

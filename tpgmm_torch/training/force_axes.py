@@ -1,0 +1,112 @@
+"""Axes along which demonstrated forces do no work, which are those to control."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
+from tpgmm_torch.operators import Operator, Wrench
+from tpgmm_torch.training.local_data import Motion
+
+__all__ = ["shares_of_work", "with_force_axes"]
+
+#: A force does no work along an axis below this share of the work that it could do. Forces
+#: against a surface have shares of 0.00 to 0.02, friction 0.26 to 0.88 (wiping).
+NO_WORK = 0.1
+ALWAYS = (
+    "{0.link!r} is in contact at all instants of all demonstrations: was the tool's weight "
+    "removed from its wrenches? Else Wrench(..., contact=) is below the noise, {0.contact} N"
+)
+
+
+def with_force_axes(
+    operators: Sequence[Operator], motions: Sequence[Motion]
+) -> tuple[Operator, ...]:
+    """Operators of forces with the axes along which the demonstrated forces do no work.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        Those that have axes keep them.
+    motions : sequence of Motion
+
+    Returns
+    -------
+    tuple of Operator
+
+    Raises
+    ------
+    DataError
+        If no force does no work, or a link is never in contact.
+    """
+
+    def completed(operator: Operator) -> Operator:
+        if not isinstance(operator, Wrench) or operator.axes is not None:
+            return operator
+        shares, sizes = shares_of_work(operator, motions)
+        found = (shares < NO_WORK) & (sizes >= operator.contact)
+        if not bool(found.any()):
+            shown = ", ".join(
+                f"{axis} {share:.2f} at {size:.1f} N"
+                for axis, share, size in zip("xyz", shares, sizes, strict=True)
+            )
+            raise DataError(
+                f"no force of {operator.link!r} in {operator.frame!r} does no work (share of "
+                f"work: {shown}; below {NO_WORK} and from {operator.contact} N on): is the "
+                "frame aligned with the surface? Else give the axes, Wrench(..., axes=[2])"
+            )
+        return replace(operator, axes=tuple(torch.nonzero(found)[:, 0].tolist()))
+
+    return tuple(map(completed, operators))
+
+
+def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:
+    """Share of work ``|sum_t f v| / (n rms(f) rms(|v|))`` of a force along each axis.
+
+    Parameters
+    ----------
+    operator : Wrench
+        Its frame's axes count, and the instants at which it is in contact.
+    motions : sequence of Motion
+        With wrenches of the link.
+
+    Returns
+    -------
+    shares : Tensor of shape (3,)
+        1 where the force has the direction of the motion, 0 where there is no motion.
+    sizes : Tensor of shape (3,)
+        Root mean square of the force along each axis [N].
+
+    Raises
+    ------
+    DataError
+        If the link is in contact at less than two instants.
+    """
+    every = replace(operator, axes=(0, 1, 2))
+    forces, speeds = [], []
+    for motion in motions:
+        local = every.coordinates(motion.state, motion.frames)
+        pose = every.pose(motion.state, motion.frames)
+        way = pose.inverse_transform(motion.state.position(operator.link))
+        touches = local[:, 3] > 0
+        if len(way) > 1:
+            [speed] = torch.gradient(way, spacing=(motion.time,), dim=0)
+            forces.append(local[touches, :3])
+            speeds.append(speed[touches])
+    force, speed = (torch.cat(each) for each in (forces, speeds))
+    if len(force) == sum(len(motion.time) for motion in motions):
+        warnings.warn(ALWAYS.format(operator), PlausibilityWarning, stacklevel=2)
+    if len(force) < 2:
+        raise DataError(
+            f"{operator.link!r} is never in contact: its force stays below "
+            f"{operator.contact} N in all demonstrations, Wrench(..., contact=)"
+        )
+    sizes = force.square().mean(0).sqrt()
+    possible = len(force) * sizes * speed.square().sum(-1).mean().sqrt()
+    work = (force * speed).sum(0).abs()
+    return torch.where(possible > 0, work / possible, 0.0), sizes
