@@ -16,8 +16,8 @@ __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
 ORDER = (
-    "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset", "camera",
-    "calibrate",
+    "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset",
+    "camera", "calibrate",
 )  # fmt: skip
 #: Those that are imported when they run, and their line in ``--help``.
 LATE = {
