@@ -15,7 +15,7 @@ from tests.support.lerobot_commands import lerobot
 from tpgmm_datasets.tables import demonstrations_from_frame, read_table
 from tpgmm_torch import Frame
 
-GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "own_data.md"
+GUIDE = Path(__file__).parents[2] / "docs" / "howto" / "own_data.md"
 #: A place of the cup that was not shown.
 CUP = Frame([0.23, 0.015, 0.03], [np.cos(0.05), 0, 0, np.sin(0.05)])
 HALF = 0.5
