@@ -17,11 +17,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
@@ -107,16 +105,14 @@ class Offsets:
             reading = wrenches.readings.get(operator.link)
             if reading is None:
                 continue
-            axes = list(operator.axes or ())
-            turn = quaternions.conjugate(operator.pose(state, frames).orientation)
             force = torch.from_numpy(reading.value[..., :3]).to(dt)
-            felt = quaternions.rotate(turn, force)[..., axes]
+            felt = operator.components(force, state, frames)
             touches = torch.from_numpy(reading.touches).to(dt.device).unsqueeze(-1)
             felt = torch.where(touches, felt, 0.0)
             wanted, share = torch.zeros_like(felt), torch.zeros_like(felt[..., :1])
             if operator in asked:
                 wanted, share = asked[operator].force, asked[operator].share.unsqueeze(-1)
-            fresh = torch.from_numpy(np.asarray(reading.age == 0)).to(dt.device)
+            fresh = torch.from_numpy(reading.fresh).to(dt.device)
             passed = torch.where(fresh, dt, 0.0).unsqueeze(-1)
             before = self.values.get(operator, torch.zeros_like(felt))
             values[operator] = self._moved(before, wanted - felt, share, passed)

@@ -83,9 +83,9 @@ def find_contacts(
     postures = scene.robot.joint_tensor(joints)
     instants = torch.as_tensor(time, dtype=torch.float64)
     state, places = held_objects(scene.robot.state(postures), instants, frames or {}, holds)
-    links, seconds, found = scene.robot.model.links, instants.numpy(), []
-    for (one, other), distance in scene.distances(postures, places, 1e-3, state).items():
-        names = (one, other) if one in links or other not in links else (other, one)
+    seconds, found = instants.numpy(), []
+    for pair, distance in scene.distances(postures, places, 1e-3, state).items():
+        names = scene.links_first(pair)
         inside = np.flatnonzero(distance < 0)
         for run in np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1):
             if len(run):

@@ -142,9 +142,12 @@ class Scene:
 
     def label(self, pair: int) -> str:
         """The names of a pair in words: "l_forearm / table"."""
-        return " / ".join(
-            sorted(self._pairs[pair], key=lambda n: n not in self.robot.model.links)
-        )
+        return " / ".join(self.links_first(self._pairs[pair]))
+
+    def links_first(self, pair: Pair) -> Pair:
+        """A pair of names, of which a link of the robot is the first."""
+        one, other = sorted(pair, key=lambda name: name not in self.robot.model.links)
+        return one, other
 
     @property
     def needed(self) -> Array:

@@ -197,36 +197,31 @@ def solids(model: Any, links: Sequence[str], base: str, visuals: bool) -> Iterat
     mujoco.mj_kinematics(model, data)
     names = [model.body(i).name or free_name(f"body{i}", ()) for i in range(model.nbody)]
     at = names.index(base) if base in names else 0
-    origin = Frame(data.xpos[at].copy(), data.xquat[at].copy())
+    bodies = [Frame(data.xpos[i].copy(), data.xquat[i].copy()) for i in range(model.nbody)]
+    bodies = [pose.seen_from(bodies[at]) for pose in bodies]
     for index in range(model.ngeom):
         if visuals or model.geom_contype[index] or model.geom_conaffinity[index]:
-            yield _solid(model, data, names, index, links, origin)
+            yield _solid(model, names, bodies, index, links)
 
 
 def _solid(
-    model: Any, data: Any, names: Sequence[str], index: int, links: Sequence[str], origin: Frame
+    model: Any, names: Sequence[str], bodies: Sequence[Frame], index: int, links: Sequence[str]
 ) -> Shape:
-    """One of the solids of a compiled model."""
-    kinds, geom, body = (
-        mujoco_module().mjtGeom,
-        model.geom(index),
-        int(model.geom_bodyid[index]),
-    )
-    kind = kinds(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()
-    size, pose = (
-        geom.size[: SIZES.get(kind, 3)].tolist(),
-        Frame(geom.pos.copy(), geom.quat.copy()),
-    )
+    """One of the solids of a compiled model, with the poses of its bodies in the base frame."""
+    geom, body = model.geom(index), int(model.geom_bodyid[index])
+    kind = mujoco_module().mjtGeom(int(model.geom_type[index])).name
+    kind = kind.removeprefix("mjGEOM_").lower()
+    size = geom.size[: SIZES.get(kind, 3)].tolist()
+    pose = Frame(geom.pos.copy(), geom.quat.copy())
     vertices = _vertices(model, index) if kind == "mesh" else None
     if names[body] in links:
         return Shape(names[body], kind, size, pose, names[body], vertices)
-    bodies = [Frame(data.xpos[i].copy(), data.xquat[i].copy()) for i in range(model.nbody)]
     root, world = int(model.body_rootid[body]), bodies[body].compose(pose)
     if _floats(model, root):
-        rest, pose = bodies[root].seen_from(origin), world.seen_from(bodies[root])
-        return Shape(names[root], kind, size, pose, names[root], vertices, rest)
+        pose = world.seen_from(bodies[root])
+        return Shape(names[root], kind, size, pose, names[root], vertices, bodies[root])
     name = names[body] if body else geom.name or f"geom{index}"
-    return Shape(name, kind, size, world.seen_from(origin), None, vertices)
+    return Shape(name, kind, size, world, None, vertices)
 
 
 def _floats(model: Any, root: int) -> bool:

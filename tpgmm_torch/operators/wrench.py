@@ -98,8 +98,7 @@ class Wrench(Operator):
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``e^T R^T f`` for each axis ``e``, and 1 where ``|f|`` reaches ``contact``."""
         force = self.force(state)
-        turn = quaternions.conjugate(self.pose(state, frames).orientation)
-        local = quaternions.rotate(turn, force)[..., list(self._axes)]
+        local = self.components(force, state, frames)
         touches = (force.norm(dim=-1, keepdim=True) >= self.contact).to(local)
         return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
 
@@ -125,6 +124,13 @@ class Wrench(Operator):
             known = [*frames, *links]
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
+
+    def components(
+        self, vector: Tensor, state: RobotState | None, frames: Mapping[str, Frame]
+    ) -> Tensor:
+        """Components (..., n_axes) along the axes, of a vector (..., 3) in the base frame."""
+        turn = quaternions.conjugate(self.pose(state, frames).orientation)
+        return quaternions.rotate(turn, vector)[..., list(self._axes)]
 
     def along_axes(
         self, values: Tensor, state: RobotState, frames: Mapping[str, Frame]

@@ -68,6 +68,11 @@ class WrenchReading:
         """Contact, and what may become one: for those who must not wait."""
         return np.asarray(self.contact | (self.changing > 0))
 
+    @property
+    def fresh(self) -> Mask:
+        """Whether it was measured at this tick."""
+        return np.asarray(self.age == 0)
+
     def update(self, measured: Array | None, dt: float | Array) -> Self:
         """The reading after a tick.
 

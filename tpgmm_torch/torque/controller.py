@@ -23,6 +23,7 @@ from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
 from tpgmm_torch.motion.follower import Follower
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
@@ -355,8 +356,8 @@ class TorqueController(Controller):
         begins = last.stopped & ~stopped
         offset = torch.where(begins.unsqueeze(-1), found.fused - last.sent, last.offset)
         since = torch.where(begins, 0.0, last.since + dt)
-        share = (since / self._blend).clamp(0.0, 1.0) if self._blend > 0 else since * 0 + 1
-        left = 1 - (share**3 * (10 + share * (6 * share - 15))).unsqueeze(-1)
+        share = since / self._blend if self._blend > 0 else torch.ones_like(since)
+        left = 1 - minimum_jerk(share).unsqueeze(-1)
         sent = torch.where(stopped.unsqueeze(-1), at_rest, found.fused - left * offset)
         torque = (bias + sent).clamp(-self._effort, self._effort)
         free = torch.where(~stopped & (bias + sent == torque).all(-1), dt, 0.0)
@@ -436,7 +437,7 @@ class TorqueController(Controller):
                 continue
             force = torch.as_tensor(reading.value[..., :3, None]).to(passed)
             error = one.force - (axes @ force).squeeze(-1)
-            fresh = torch.as_tensor(reading.age == 0).to(passed.device)
+            fresh = torch.from_numpy(reading.fresh).to(passed.device)
             counts = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
             left = torch.exp(-(1 - one.share) * dt / Admittance.release).unsqueeze(-1)
             value = self._drive.integrals.get(one.operator, torch.zeros_like(error)) * left

@@ -134,8 +134,9 @@ class Mechanics:
         accelerations = jacobians @ inverse.unsqueeze(-3)
         mobility = accelerations @ jacobians.mT
         masses, seen = _inverse(mobility)
-        stiff = gains.joint_stiffness(inertia), gains.link_stiffness(mobility)
-        joint, link = stiffness or stiff
+        if stiffness is None:
+            stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(mobility)
+        joint, link = stiffness
         twice = 2 * gains.damping_ratio
         joint_damping = twice * geometric_mean(inertia, joint)
         link_damping = twice * geometric_mean(link, masses)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lerobot_env_bimanual.so101.env import OPEN, BiSo101Env
@@ -22,6 +23,7 @@ from lerobot_env_bimanual.so101.scene import (
     STEM,
     BiSo101Scene,
 )
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["MEETING", "PHASES", "teleoperated"]
 
@@ -121,7 +123,7 @@ def _above(pose: Array, height: float) -> Array:
 
 def _jerk(share: float) -> float:
     """Minimum jerk from 0 to 1."""
-    return share**3 * (10 - 15 * share + 6 * share**2)
+    return float(minimum_jerk(torch.tensor(share, dtype=torch.float64)))
 
 
 class _Arm:
