@@ -78,5 +78,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """What there is to ask for, whether or not it is loaded yet."""
+    """Public names, whether or not they are loaded yet."""
     return sorted({*globals(), *__all__})

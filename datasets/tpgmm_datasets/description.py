@@ -1,4 +1,4 @@
-"""What is in a data set, and what is wrong with it, without making demonstrations of it."""
+"""Description of a data set and its faults, without making demonstrations of it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ColumnInfo(Feature):
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What :func:`describe_lerobot` returns.
+    """Description of a data set, returned by :func:`describe_lerobot`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is wrong with a data set on disk, and where."""
+"""Errors of a data set on disk, and where they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a motor's value is as a joint of the URDF, estimated from postures with known poses."""
+"""Signs and offsets from motors to joints of the URDF, from postures with known poses."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ class _Problem:
         return position * self.position_std, turn * self.orientation_std if known else math.nan
 
     def _residual(self, signs: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """What is left (S, 6 n) in units of its accuracy, and how offsets lessen it."""
+        """Residuals (S, 6 n) in units of their accuracy, and their Jacobian by the offsets."""
         joints = self.angles.expand(len(signs), *self.angles.shape).clone()
         joints[..., self.chosen] *= signs[:, None]
         joints[..., self.chosen] += offsets[:, None]

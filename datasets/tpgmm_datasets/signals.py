@@ -1,4 +1,4 @@
-"""What a data set calls its signals: what a policy that was learned from it must know."""
+"""Names of a data set's signals: what a policy that was learned from it must know."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _renamed(
 
 
 def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
-    """What else holds the joints declares the same units, if any."""
+    """Check that other columns of the joints declare the same units, if any."""
     names, units = feature.names or (), feature.units or ()
     matched = match_names(list(scales), names, feature.key, REMEDY)
     own = shifted(units, feature.offsets, feature.key)

@@ -166,7 +166,7 @@ class Column:
 
     @property
     def declared(self) -> dict[str, Any]:
-        """What ``info.json`` says of it."""
+        """Its entry in ``info.json``."""
         dtype = str(next(iter(self.values.values())).dtype)
         return {"dtype": dtype, "shape": [len(self.names)], "names": list(self.names)}
 

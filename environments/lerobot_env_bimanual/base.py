@@ -1,4 +1,4 @@
-"""What the environments have in common: joints and objects are observed, and can be drawn."""
+"""Base of the environments: joints and objects are observed, and can be drawn."""
 
 from __future__ import annotations
 

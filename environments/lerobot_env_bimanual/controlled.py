@@ -192,7 +192,7 @@ class ControlledEnv(StateEnv):
         return Rig(self._scene, views, **usual | options)
 
     def cell_of_joints(self) -> dict[str, Any]:
-        """What a cell file says of the joints."""
+        """Joints' entry of a cell file."""
         return {"joints": list(self.joint_names)}
 
     def close(self) -> None:
@@ -391,7 +391,7 @@ class ControlledEnv(StateEnv):
             self._past.append((self._time, self._remembered()))
 
     def _remembered(self) -> Any:
-        """What :meth:`_restore` needs to know of the present."""
+        """State that :meth:`_restore` needs."""
         return self._scene.snapshot()
 
     def _put_back(self, time: float) -> None:

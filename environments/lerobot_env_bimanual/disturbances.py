@@ -1,4 +1,4 @@
-"""What can go wrong in an episode: stops, shoves, moved objects, failing eyes and clocks.
+"""Disturbances of an episode: stops, shoves, moved objects, failing eyes and clocks.
 
 A condition is some disturbances at once, or none, ``"nominal"``. As text they are joined by
 ``+``: ``"stopped-3+live"``.
@@ -104,7 +104,7 @@ class Disturbance:
     def seen(
         self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
     ) -> Vector:
-        """What is observed of the objects.
+        """Observed poses of the objects.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class Displaced(Disturbance):
 
     @property
     def delay(self) -> float:
-        """What has to be done a second time, and what passes while it is held."""
+        """Motion that has to be repeated, and time that passes while the robot is held."""
         return HELD + max(0.0, -self.seconds)
 
     def stops(self, time: float) -> bool:

@@ -1,4 +1,4 @@
-"""What differs between episodes of a robot that follows joint references."""
+"""Starts of episodes of a robot that follows joint references."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PUSHED = ("shoulder_pitch", "shoulder_yaw", "arm_waist", "arm_shoulder", "elbow"
 
 @dataclass(frozen=True)
 class Start:
-    """What an episode draws from its seed: always all of it, in the same order.
+    """Start of an episode, drawn from its seed: always all of it, in the same order.
 
     Parameters
     ----------

@@ -330,7 +330,7 @@ def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
 
 
 def _action_scale(postprocessor: Any, config: PreTrainedConfig) -> Tensor:
-    """What a unit of the normalised action is [rad]."""
+    """Size of a unit of the normalised action [rad]."""
     zero = torch.zeros(1, *config.output_features[ACTION].shape)
     scale: Tensor = (postprocessor(zero + 1) - postprocessor(zero))[0]
     return scale

@@ -49,7 +49,7 @@ PEAKS = {
 
 
 class Benchmark(ABC):
-    """What has to be known of an environment.
+    """Description of an environment.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class Benchmark(ABC):
 
     @property
     def all_conditions(self) -> tuple[str, ...]:
-        """What ``--conditions all`` means."""
+        """Conditions of ``--conditions all``."""
         return tuple(dict.fromkeys((NOMINAL, *self.conditions, *self.disturbances)))
 
     @abstractmethod
@@ -210,7 +210,7 @@ class _HandlingBenchmark(Benchmark):
         return start
 
     def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
-        """What is measured while the environment follows a motion; whether it succeeds."""
+        """Measures of the environment following a motion; whether it succeeds."""
         observation, info = env.reset(seed=seed, options=self._start(motion))
         measured, seen, done = [], [], False
         references = _references(motion).numpy()

@@ -28,7 +28,7 @@ ALL_CONDITIONS = "all"
 
 @dataclass(frozen=True)
 class Comparison:
-    """What became of a comparison.
+    """Result of a comparison.
 
     Parameters
     ----------

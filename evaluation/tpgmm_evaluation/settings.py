@@ -1,4 +1,4 @@
-"""What all cells of a comparison have in common."""
+"""Settings that all cells of a comparison have in common."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Settings:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """What :meth:`keep` wrote.
+        """Read back the settings that :meth:`keep` wrote.
 
         Raises
         ------

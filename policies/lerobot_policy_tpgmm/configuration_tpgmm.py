@@ -43,7 +43,7 @@ NO_CELL = "none"
 
 @dataclass
 class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
-    """What a policy shares that sees the present state alone, in SI units."""
+    """Base configuration of policies that see the present state alone, in SI units."""
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(
@@ -274,7 +274,7 @@ class TPGMMConfig(StatePolicyConfig):
         return rate
 
     def link_poses(self) -> dict[str, LinkPose]:
-        """What ``link_frames`` stands for."""
+        """Link poses that ``link_frames`` stands for."""
         return {name: LinkPose.parse(text) for name, text in self.training.link_frames.items()}
 
     def kinematics(self) -> Kinematics | None:
@@ -318,7 +318,7 @@ class TPGMMConfig(StatePolicyConfig):
         return TaskParameterizedGMM(count, operators, kinematics, fusion=fusion, **settings)
 
     def given_holds(self) -> tuple[Hold, ...] | None:
-        """What ``holds`` describes; None if it is found."""
+        """Holds that ``holds`` describes; None if they are to be found."""
         return None if self.holds is None else tuple(map(Hold.parse, self.holds))
 
     def validate_features(self) -> None:

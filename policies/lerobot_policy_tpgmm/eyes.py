@@ -61,7 +61,7 @@ def take_over(given: Any, learned: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def watching(cell: Any, robot: Kinematics, frames: FrameFeatures) -> Any:
-    """What finds the frames of a policy, if it has a cell that has a source of poses."""
+    """Source of a policy's frames, if it has a cell with a source of poses."""
     if cell is None or cell.source == NO_CELL:
         return None
     from tpgmm_vision.watching import Watch

@@ -233,7 +233,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
 
     def _make_mixture(self, operators: Sequence[Operator], model: Any) -> None:
-        """What is learned by gradient: the mixture of a model of given structure.
+        """Mixture of a model of given structure, to be learned by gradient.
 
         Optimizers are made before a fit, so what it decides on has one stand-in parameter each.
         """
@@ -390,7 +390,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @property
     def skill(self) -> Skill:
-        """What an episode runs: the model's skill, through the via-points."""
+        """Skill that an episode runs: the model's, through the via-points."""
         skill, points = _skill(self.to_estimator()), self.config.via_points
         return ViaPoints(skill, points, self.config.via_fade) if points else skill
 
@@ -649,7 +649,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return super().train(mode)
 
     def get_optim_params(self) -> Any:
-        """What gradient training changes: the mixture."""
+        """Parameters that gradient training changes: the mixture."""
         return self.mixture.parameters()
 
     def _save_pretrained(
@@ -751,7 +751,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
 
 def _skill(model: Any) -> Any:
-    """What runs of a model, or a skill itself."""
+    """Skill of a model, or a skill itself."""
     return model.skill if isinstance(model, TaskParameterizedGMM) else model
 
 

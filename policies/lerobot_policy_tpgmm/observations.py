@@ -140,7 +140,7 @@ class JointFeatures(nn.Module):
         return self.targets(action)[..., self.order.argsort()]
 
     def targets(self, action: Tensor) -> Tensor:
-        """What actions (..., n_action) ask of the joints ``order``, in the model's units."""
+        """Targets of the joints ``order`` of actions (..., n_action), in the model's units."""
         return action * self.back[:, 0] + self.back[:, 1]
 
 

@@ -17,7 +17,7 @@ held
     moves, time goes on, from when it came to rest; and where no more than that is wanted.
 
 Where several joints are off, and the skill explains the posture at another time, the robot was
-displaced, and time goes there; one joint that is off is an offset sooner than another place.
+displaced, and time goes there; a single joint that is off is rather an offset.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class Hold:
     Raises
     ------
     DataError
-        If names or times are none, or the end is not after the beginning.
+        If a name is not text, a time is not finite, or the end is not after the beginning.
 
     Examples
     --------

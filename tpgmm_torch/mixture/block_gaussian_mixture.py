@@ -81,7 +81,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Equal bins along the first column (with bins of random sizes in further starts),
         k-means on standardised data, or the nearest of K random points.
     group_size : int, default=1
-        In ``fit``, so many consecutive rows share one responsibility, that of the geometric
+        In ``fit``, this many consecutive rows share one responsibility, that of the geometric
         mean of their densities: demonstrations of one skill at one instant, for example.
     random_state : int, RandomState or None, default=None
         For the starts, for components that are reseeded, and for :meth:`sample`.
@@ -434,7 +434,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return Parameters(self.weights_.double(), *own)
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
-        """What a function makes of the log of weight times density, (K, n), of the rows."""
+        """Apply a function to the log of weight times density, (K, n), of the rows."""
         parameters, dtype = self._fitted(), self.weights_.dtype
         points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
         # centred, so that offsets cost no digits

@@ -190,7 +190,7 @@ def log_joint(
 
 @dataclass(frozen=True)
 class Expectation:
-    """What one pass over the points leaves: all that the M step needs.
+    """Sufficient statistics of one pass over the points: all that the M step needs.
 
     Attributes
     ----------
@@ -325,7 +325,7 @@ class _Sums:
 
 
 def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
-    """What no log-density of the components exceeds in each chunk, (n_chunks, K)."""
+    """Upper bounds of the log-densities of the components in each chunk, (n_chunks, K)."""
     mean = torch.stack([mean[:, 0] for mean in parameters.means], 1)
     variance = torch.stack([covariance[:, 0, 0] for covariance in parameters.covariances], 1)
     low, high = spans[:, :, None].unbind(1)
@@ -446,7 +446,7 @@ def _worst(parameters: Parameters, points: Points, count: int) -> Tensor:
 
 @dataclass
 class Fit:
-    """What expectation-maximisation came to.
+    """Result of expectation-maximisation.
 
     Attributes
     ----------

@@ -115,7 +115,7 @@ class Points:
         Parameters
         ----------
         every : int, default=1
-            Only every so many rows count.
+            Every how many rows one is used.
 
         Returns
         -------

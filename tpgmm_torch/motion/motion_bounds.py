@@ -140,7 +140,7 @@ class MotionBounds:
         MissingLimitsWarning
             If the description of the robot lacks limits of position or speed that are not
             given either; not where it has none of speed at all, as an MJCF, nor of joints of
-            which a warning told when the robot was made.
+            which the robot warned when it was made.
         """
         if not isinstance(kinematics, Kinematics):  # a skill
             demonstrated = demonstrated or kinematics.peaks

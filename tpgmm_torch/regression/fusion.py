@@ -154,7 +154,7 @@ class KalmanUpdate:
         state: RobotState,
         frames: Mapping[str, Frame],
     ) -> tuple[Tensor, Tensor]:
-        """What A components say of the joints, in terms of the step ``q - q_{t-1}``.
+        """Fused estimates of the joints by A components, in terms of the step ``q - q_{t-1}``.
 
         Parameters
         ----------

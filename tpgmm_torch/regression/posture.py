@@ -1,4 +1,4 @@
-"""What is wanted now: the posture that minimises the fused cost within limits of position.
+"""The wanted posture: the one that minimises the fused cost within limits of position.
 
 A tick asks for one step of the linearised product (2). That is all there is to do while what is
 wanted stays near: then the step is exact to second order. For what is far away, or cannot be

@@ -43,7 +43,7 @@ def rotation_log_density(
     Parameters
     ----------
     regression : Regression
-        Of a robot whose joints are none of the quaternions.
+        Of a robot without quaternions among its joints.
     time : Tensor of shape (T,)
     local : sequence of Tensor of shape (T, D_j)
         Local coordinates of each operator; quaternions on the side that is expected.

@@ -272,7 +272,7 @@ class Kinematics(abc.ABC):
     without_limits : tuple of str, default=()
         Joints of which limits should be known and are not.
     doubtful : tuple of str, default=()
-        Those of them of which a warning told when the robot was made.
+        Those of them that the robot named in a warning when it was made.
     quaternion_starts : tuple of int, default=()
         Where unit quaternions start in the joint vector; robots have none.
     lengths : tuple of int, default=()

@@ -247,7 +247,7 @@ class Robot(Described):
         ------
         DataError
             If there is no robot, one was not made by this class, its base is moved by its own
-            joints, names collide, or a pose is none.
+            joints, names collide, or a pose is not seven finite numbers.
         UnknownNameError
             If ``poses`` names no robot, or ``base`` no link.
 
@@ -638,8 +638,8 @@ def _limit_leader(
 ) -> bool:
     """Apply the limits of a joint that mimics another to that other, which moves with it.
 
-    Limits that leave it a single point, as where a sign was forgotten, are none: the answer
-    is False.
+    Limits that leave it a single point, as where a sign was forgotten, do not count: the
+    answer is False.
     """
     leader = model.leader(joint.name)
     if leader.joint not in own or leader.multiplier == 0:

@@ -353,7 +353,7 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
 
 
 def _number(text: str | float) -> float:
-    """What an attribute says, NaN where that is no number."""
+    """Number in an attribute, NaN where it is no number."""
     try:
         return float(text)
     except ValueError:

@@ -272,12 +272,12 @@ class Inputs:
 
 
 def _mapping(values: Any) -> Mapping[str, Any]:
-    """What was given by name; nothing if it was not."""
+    """Values by name; empty if none were given."""
     return values if isinstance(values, Mapping) else {}
 
 
 def _number(value: Any) -> Floats:
-    """An age; not a number if it is none."""
+    """An age; NaN if it is not a number."""
     try:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError):

@@ -9,8 +9,8 @@ payload, an encoder that slipped):
 r is the reference that was sent, p the derivative over time, y the reading, and g_k the gap
 that a lag and the offset leave. A gap is judged against the readings' noise, what is not known
 of the offset, and a share of the servo's own gap, whatever the rate of the loop. Of the lags
-that are possible each may explain it: a joint does not follow if none does. How far the
-reference may lead is told by the shortest one.
+that are possible each may explain it: a joint does not follow if none does. The
+shortest one bounds how far the reference may lead.
 
 A robot that does not follow must not be explained by a long lag or by an offset: lags are
 learned while gaps are usual and the joint moves, offsets while gaps are usual.

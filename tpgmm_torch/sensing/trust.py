@@ -257,7 +257,7 @@ class JointReading(Reading):
 
     @property
     def _speed(self) -> Floats:
-        """What no joint exceeds (n_joints,) [rad/s]."""
+        """Largest speed of each joint (n_joints,) [rad/s]."""
         return SPEED_MARGIN * np.minimum(self.velocity, UNKNOWN_SPEED)
 
     def _near(self, seen: Floats, other: Floats, elapsed: float | Floats) -> Mask:

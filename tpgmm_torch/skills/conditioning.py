@@ -1,4 +1,4 @@
-"""The reproduction, given via-points: conditioning without learning anew.
+"""The reproduction, given via-points: conditioning without learning again.
 
 A mixture says what the joints are at each instant, ``N(m_t, P_t)``, and not how what they
 are at one instant goes with what they are at another. To condition it on a via-point takes

@@ -53,7 +53,7 @@ class ViaPoint:
     Raises
     ------
     DataError, ShapeError
-        If numbers are none, or operator and value do not fit together.
+        If numbers are not finite, or operator and value do not fit together.
 
     Examples
     --------
@@ -156,7 +156,7 @@ class ViaPoint:
         Raises
         ------
         DataError, ShapeError, UnknownNameError
-            If they are not those of the operator, or quaternions are none.
+            If they are not those of the operator, or the norm of a quaternion is not 1.
         """
         like, size = kinematics.lower, self.operator.dimension(kinematics)
         if isinstance(self.value[0], tuple):

@@ -1,1 +1,1 @@
-"""What a skill is made of, found in demonstrations: operators that matter, components."""
+"""Structure of a skill, found in demonstrations: operators that matter, components."""

@@ -1,4 +1,4 @@
-"""What operators say of demonstrations that were left out, instant by instant.
+"""Likelihood of left-out demonstrations under each operator, instant by instant.
 
 At its cheapest a model has one Gaussian per operator and instant: mean and variances of the
 local coordinates of all demonstrations but one. At the posture q of the one left out, whose

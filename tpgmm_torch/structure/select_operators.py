@@ -282,7 +282,7 @@ class SelectOperators(DemonstrationEstimator):
 def candidate_operators(
     kinematics: Kinematics | None, demonstration: Demonstration
 ) -> list[Operator]:
-    """What :class:`SelectOperators` chooses from where nothing is named.
+    """Operators that :class:`SelectOperators` chooses from where nothing is named.
 
     Parameters
     ----------
@@ -341,7 +341,7 @@ def arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
 
 
 def _unit(operator: Operator, rows: int, kinematics: Kinematics) -> tuple[float, str]:
-    """What turns numbers in the rows of an operator's Jacobian into the unit it has."""
+    """Factors from the rows of an operator's Jacobian to its unit."""
     if isinstance(operator, POSITIONS):
         return 1e3, "mm"
     if isinstance(operator, ORIENTATIONS):  # a quaternion's four, or a rotation vector's three

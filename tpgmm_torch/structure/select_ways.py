@@ -82,7 +82,7 @@ class SelectWays(DemonstrationEstimator):
     there. So each operator's coordinates are looked at stretch by stretch along aligned time:
     the demonstrations' means there, on each of their principal axes, are divided into 1, 2, ...
     modes of one variance, and BIC says how many. To have looked at B places costs log B nats
-    for each mode more, so that chance gaps between few demonstrations are none. Modes are
+    for each mode more, so that chance gaps between few demonstrations do not count. Modes are
     divided again in the same manner.
 
     What a shift in time by ``shift`` explains is no other way, nor is what the situation
@@ -93,9 +93,10 @@ class SelectWays(DemonstrationEstimator):
     model : TaskParameterizedGMM
         Its operators' coordinates count, and each way is learned with its parameters.
     n_ways : "auto" or int, default="auto"
-        A number divides demonstrations into so many where that is plainest, whatever BIC says.
+        A number divides demonstrations into that many ways where they differ most, whatever
+        BIC says.
     max_ways : int, default=4
-        At most so many at one place.
+        Largest number of ways at one place.
     shift : float, default=0.1
         Share of the duration by which demonstrations may be early or late.
 

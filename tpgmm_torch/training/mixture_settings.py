@@ -1,4 +1,4 @@
-"""What the estimator's parameters come to, once demonstrations and a robot are given."""
+"""Settings of the mixture, from the estimator's parameters, demonstrations and a robot."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def kinematics_for(
     dtype: str,
     device: str,
 ) -> Kinematics:
-    """What the operators act on, checked to have what they need.
+    """Kinematics that the operators act on, checked to have what they need.
 
     Parameters
     ----------

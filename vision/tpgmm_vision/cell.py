@@ -116,7 +116,7 @@ class CellCheck:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """What a workcell is to its cameras.
+    """Description of a workcell: cameras, objects, checks and offsets.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class Cell:
     content: Mapping[str, Any] = field(default_factory=dict)
 
     def differences(self, other: Cell) -> list[str]:
-        """What is another one in another cell, in words, one for each thing."""
+        """Differences from another cell, in words, one for each thing."""
         found = []
         for kind in ("cameras", "objects", "checks"):
             one, two = getattr(self, kind), getattr(other, kind)
@@ -379,7 +379,7 @@ def _pose(value: Any, where: str) -> Array:
 
 
 def _located(make: Callable[..., Any], where: str, *given: Any, **options: Any) -> Any:
-    """What a function makes; its errors say where the entry is."""
+    """Value of a function; its errors say where the entry is."""
     try:
         return make(*given, **options)
     except DataError as error:
@@ -411,7 +411,7 @@ def _check(value: Any, where: str) -> CellCheck:
 
 
 def camera_content(camera: Camera, key: str) -> dict[str, Any]:
-    """What a cell file says of a camera without a pose."""
+    """Entry in a cell file of a camera without a pose."""
     return {
         "key": key,
         "size": [camera.width, camera.height],
@@ -422,5 +422,5 @@ def camera_content(camera: Camera, key: str) -> dict[str, Any]:
 
 
 def pose_content(pose: Array) -> list[float]:
-    """What a file says of a pose: rounded to a micrometre and a microradian."""
+    """Entry in a file of a pose, rounded to a micrometre and a microradian."""
     return [round(float(one), 7) for one in pose_vector(pose)]

@@ -174,7 +174,7 @@ class Watch:
         return pose_vector(mean_pose(pose_matrix(recent))[0])
 
     def missing(self) -> list[str]:
-        """What an episode cannot begin for, in words."""
+        """Reasons why an episode cannot begin, in words."""
         return list(self.ages()) or [
             f"robot {row} does not see {self._why(row, name)}"
             for row in range(len(self._seen))

@@ -290,7 +290,7 @@ class _Measure:
         }
 
     def demonstrations(self, demonstrations: Sequence[Demonstration]) -> dict[str, Any]:
-        """What the demonstrations themselves reach, before alignment."""
+        """Errors of the demonstrations themselves, before alignment."""
         contacts = [
             d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))] for d in demonstrations
         ]

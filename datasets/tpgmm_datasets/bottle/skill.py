@@ -72,7 +72,7 @@ def upper_body(**options: object) -> Robot:
 
 @dataclass(frozen=True)
 class BottleSkill:
-    """What skills of two hands with a bottle share.
+    """Common parts of skills of two hands with a bottle.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ JointEvent = tuple[int, float, float]
 
 @dataclass(frozen=True)
 class RecordingSummary(EpisodeSummary):
-    """What the checks need of a recording, beyond what ``fit`` checks.
+    """Summary of a recording for the checks, beyond those of ``fit``.
 
     Parameters
     ----------

@@ -137,7 +137,7 @@ def stored_frames(
 
 @dataclass(frozen=True)
 class Assembly:
-    """What a demonstration is made of.
+    """Columns and settings that a demonstration is made of.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Assembly:
 
     @property
     def features(self) -> list[Feature]:
-        """What has to be read."""
+        """Features that have to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
         wrenches = wrench_features(self.layout)

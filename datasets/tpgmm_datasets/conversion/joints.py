@@ -63,7 +63,7 @@ class JointColumns:
 
     @property
     def scales(self) -> list[Scale]:
-        """What brings each stored value to radians or metres, declared offsets included."""
+        """Scales and offsets from stored values to radians or metres."""
         return shifted(self.units, self.feature.offsets, self.feature.key)
 
     @property

@@ -64,7 +64,7 @@ TIME_TOLERANCE = 0.01
 def features_of(
     demonstrations: Sequence[Demonstration], dtype: str, units: Mapping[str, str] | None = None
 ) -> Features:
-    """What ``info.json`` declares for these demonstrations, told as ``save_lerobot`` is.
+    """Features in ``info.json`` of these demonstrations; parameters as of ``save_lerobot``.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def features_of(
 def with_frames(
     old: Feature | None, frames: Sequence[str], dtype: str = "float32"
 ) -> dict[str, Any]:
-    """What is declared of ``observation.environment_state``, with frames behind the old values.
+    """Declaration of ``observation.environment_state``, with frames behind the old values.
 
     Raises
     ------

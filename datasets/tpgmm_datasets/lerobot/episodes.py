@@ -49,7 +49,7 @@ class EpisodeRows:
 
 
 class Relaxed:
-    """What to do with a problem: raise it, or keep it if its check is among ``relax``.
+    """Reaction to a problem: raise it, or keep it if its check is among ``relax``.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ class Feature:
 
     @property
     def called(self) -> tuple[str, ...]:
-        """What messages call its values."""
+        """Name of its values in messages."""
         return self.names or tuple(f"value {i}" for i in range(self.width))
 
     @property

@@ -18,7 +18,7 @@ OFF_GRID, LONGEST_STEP = 0.01, 1.5
 
 
 def time_problems(timestamps: Array, fps: float, **where: Any) -> Iterator[DatasetError]:
-    """What is wrong with the timestamps of an episode, shape (T,)."""
+    """Faults of the timestamps of an episode, shape (T,)."""
     where = {**where, "column": "timestamp"}
     finite = np.isfinite(timestamps)
     if not finite.all():

@@ -87,7 +87,7 @@ def record_aloha(
 def _episode(
     env: AlohaStateEnv, expert: AlohaExpert, seed: int
 ) -> tuple[Demonstration, NDArray[np.float64]]:
-    """What was measured in one episode, and the references."""
+    """Measurements and references of one episode."""
     observation, _ = env.reset(seed=seed)
     poses = observation["environment_state"].reshape(-1, 7)
     frames = {

@@ -1,4 +1,4 @@
-"""What differs between episodes with the bottle."""
+"""Conditions of episodes with the bottle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tasks with the bottle share: an upper body whose hands close around it."""
+"""Common parts of the tasks with the bottle: an upper body whose hands close around it."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ TABLE_LOW, TABLE_SPEED = -0.08, 0.2
 
 
 def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
-    """What the model is made of.
+    """Specification of the model.
 
     Parameters
     ----------

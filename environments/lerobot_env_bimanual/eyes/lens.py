@@ -90,7 +90,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Imperfections:
-    """What spoils the pictures of a camera.
+    """Imperfections of a camera's pictures.
 
     Parameters
     ----------

@@ -120,7 +120,7 @@ class Rig:
         self._geoms = np.concatenate([first + np.arange(n) for first, n in pairs])
 
     def pictures(self, rng: np.random.Generator) -> dict[str, NDArray[np.uint8]]:
-        """What the cameras see now.
+        """Pictures of the cameras now.
 
         Parameters
         ----------

@@ -147,7 +147,7 @@ class BiSo101Env(ControlledEnv):
         return np.asarray((joints - self._zero) / self._factor)
 
     def cell_of_joints(self) -> dict[str, Any]:
-        """What a cell file says of the joints, with the true offsets."""
+        """Joints' entry of a cell file, with the true offsets."""
         pairs = zip(self.joint_names, self.offsets.tolist(), strict=True)
         offsets = {name: offset for name, offset in pairs if offset}
         return {**super().cell_of_joints(), "joint_offsets": offsets}

@@ -94,7 +94,7 @@ class PickPlace(Handover):
 
     @staticmethod
     def parts(recorded: Demonstration) -> dict[str, Demonstration]:
-        """What is recorded of each skill, each on a clock that begins at 0."""
+        """Recordings of each skill, each on a clock that begins at 0."""
         ends = [-math.inf, *(recorded.events[last] for last in SKILLS.values())]
         found = {}
         for name, (begin, end) in zip(SKILLS, pairwise(ends), strict=True):

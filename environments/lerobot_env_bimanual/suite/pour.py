@@ -188,7 +188,7 @@ def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:
 
 
 class _Judge(Judge):
-    """What flows leaves where the jug's rim is lowest, as fast as that moves, and falls."""
+    """Judge of pouring: drops leave the jug's rim where it is lowest, with its velocity."""
 
     def __init__(self) -> None:
         self.full = 1.0

@@ -185,7 +185,7 @@ class SuiteScene(RobotScene):
         return total
 
     def force(self, first: str, second: str) -> NDArray[np.float64]:
-        """What one body does to another where they touch, friction too; shape (3,) [N]."""
+        """Force of one body on another where they touch, friction too; shape (3,) [N]."""
         total, model = np.zeros(3), self.model
         bodies = model.body(first).id, model.body(second).id
         for index, geoms in enumerate(self.data.contact.geom):
@@ -195,7 +195,7 @@ class SuiteScene(RobotScene):
         return total
 
     def wrench(self, body: str) -> NDArray[np.float64]:
-        """What a body does to all it touches, at its origin, shape (6,) [N, N m]."""
+        """Wrench of a body on all it touches, at its origin, shape (6,) [N, N m]."""
         total, own = np.zeros(6), self.model.body(body).id
         for index, geoms in enumerate(self.data.contact.geom):
             first, second = self.model.geom_bodyid[geoms]

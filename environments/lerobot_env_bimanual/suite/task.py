@@ -1,4 +1,4 @@
-"""What a task of the suite consists of, and demonstrations as people would give them.
+"""A task of the suite, and demonstrations as people would give them.
 
 A scripted expert knows where everything is, and moves both hands along ways that it fixes
 beforehand. Nobody does it twice in the same manner: durations, ways through free space, the
@@ -91,7 +91,7 @@ class Style:
 
     @classmethod
     def none(cls, n: int, joints: int) -> Style:
-        """What the expert would do at best."""
+        """Motion of the expert without noise."""
         aside, free = (n, 2, 3), (n, 3)
         shapes = ((n, joints), aside, aside, free)
         return cls(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
@@ -289,7 +289,7 @@ class SuiteTask(ABC):
     def nominal(
         self, poses: Mapping[str, Pose], joints: NDArray[np.float64], rate: float = 100.0
     ) -> Demonstration:
-        """What the expert would do at best.
+        """Motion of the expert without noise.
 
         Parameters
         ----------

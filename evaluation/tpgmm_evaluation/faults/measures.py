@@ -1,4 +1,4 @@
-"""What went wrong in a run: bounds, status, end, gap, runaway."""
+"""Measures of faults in a run: bounds, status, end, gap, runaway."""
 
 from __future__ import annotations
 

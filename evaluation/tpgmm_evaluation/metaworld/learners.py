@@ -1,4 +1,4 @@
-"""What learns a task of Meta-World from a few episodes, each with one setting for all tasks."""
+"""Learners of tasks of Meta-World from a few episodes, each with one setting for all tasks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ ABSENT = 1e-6
 
 
 class Actor(Protocol):
-    """What acts in :class:`MetaworldStateEnv`, with actions of one ``control``.
+    """Policy in :class:`MetaworldStateEnv`, with actions of one ``control``.
 
     ``outcome`` says why its training ended.
     """

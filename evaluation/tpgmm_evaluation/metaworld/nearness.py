@@ -1,4 +1,4 @@
-"""What one demonstration cannot say: that a hand near an object is there because of it.
+"""Nearness in one demonstration: a hand near an object is taken to be there because of it.
 
 Demonstrations tell which frame matters by how little they vary in it. A single one varies in
 none, and three vary little by chance. The prior here says what holds before any is seen: the

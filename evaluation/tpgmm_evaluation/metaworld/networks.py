@@ -67,7 +67,7 @@ class Perceptron:
 
 
 class PerceptronActor:
-    """What a :class:`Perceptron` learned."""
+    """Policy that a :class:`Perceptron` learned."""
 
     control = "displacement"
     outcome = "its updates were done"

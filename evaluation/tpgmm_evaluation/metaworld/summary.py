@@ -1,4 +1,4 @@
-"""What was measured, in tables and a picture: groups of tasks, numbers of demonstrations."""
+"""Tables and a picture of results: groups of tasks, numbers of demonstrations."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def task_table(results: Iterable[Result]) -> str:
 
 
 def cost_table(results: Iterable[Result]) -> str:
-    """What training and acting take, and why trainings ended, as Markdown.
+    """Costs of training and acting, and why trainings ended, as Markdown.
 
     Medians over the finished cells, ``results``, in seconds of the processor for a training and
     in milliseconds for an action.

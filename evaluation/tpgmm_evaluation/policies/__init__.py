@@ -1,1 +1,1 @@
-"""What TP-GMM is compared with: learned baselines, and replay."""
+"""Policies that TP-GMM is compared with: learned baselines, and replay."""

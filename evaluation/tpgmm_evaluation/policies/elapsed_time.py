@@ -67,7 +67,7 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
         self._count = 0
 
     def get_config(self) -> dict[str, Any]:
-        """What ``policy_preprocessor.json`` holds of it."""
+        """Its entry in ``policy_preprocessor.json``."""
         return {"fps": self.fps}
 
     def transform_features(

@@ -1,4 +1,4 @@
-"""What the baselines share: those that plan ahead, and those that predict the next actions."""
+"""Common parts of the baselines: those that plan ahead, and those that predict actions."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class PlannedPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
 @dataclass
 class SituatedConfig(PlannedConfig):
-    """What a policy has to know that plans in a robot's joints, from poses of objects.
+    """Configuration of a policy that plans in a robot's joints, from poses of objects.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class SituatedConfig(PlannedConfig):
 
 @dataclass(frozen=True)
 class Observed:
-    """What the plan of one robot is made from.
+    """Observation that the plan of one robot is made from.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ class MeanPolicy(SituatedPolicy):
 
 @dataclass
 class MovesConfig(SituatedConfig):
-    """What policies share that go from key pose to key pose.
+    """Base configuration of policies that go from key pose to key pose.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class MovesPolicy(SituatedPolicy):
         return super().fit(aligned, moves=moves, **options)
 
     def recipe(self) -> dict[str, Any]:
-        """What was chosen, and what was found in the demonstrations."""
+        """Settings that were chosen or found in the demonstrations."""
         usual = {part.name for part in fields(SituatedConfig)} | {"moves"}
         chosen = [part.name for part in fields(self.config) if part.name not in usual]
         frames = [

@@ -70,7 +70,7 @@ GOLDENS: Mapping[str, Callable[[Plan], Measured]] = {
 def _golden(
     model: TaskParameterizedGMM, shown: Sequence[Demonstration], situations: Sequence[Situation]
 ) -> Measured:
-    """What was learned, its likelihood, references, and a batch of single steps."""
+    """Golden values: parameters, likelihood, references, and a batch of single steps."""
     model.fit(shown)
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(shown[0]), size=STATES)

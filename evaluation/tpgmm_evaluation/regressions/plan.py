@@ -24,7 +24,7 @@ Measured = Mapping[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure, and where.
+    """Plan of measurements, and where they are kept.
 
     Parameters
     ----------

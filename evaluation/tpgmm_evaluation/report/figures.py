@@ -38,7 +38,7 @@ BRIGHT = 0.6
 
 
 def _family(policy: str) -> str:
-    """What a policy is a variant of: the shortest name that its own begins with."""
+    """Family of a policy: the shortest name that its own begins with."""
     first = policy.split()[0]
     names = (name for name in POLICIES if first == name or first.startswith(f"{name}-"))
     return min(names, key=len, default=first)
@@ -120,7 +120,7 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
 
 
 def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, Any]:
-    """What all lines of a policy look like."""
+    """Style of all lines of a policy."""
     return {
         "color": colour,
         "marker": marker,

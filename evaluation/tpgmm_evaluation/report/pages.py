@@ -1,4 +1,4 @@
-"""What the pages of a comparison share: numbers, tables and remarks as Markdown."""
+"""Common parts of the pages of a comparison: numbers, tables and remarks as Markdown."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def ordered(policies: Iterable[str]) -> list[str]:
 
 
 def described(policy: str) -> str:
-    """What a policy is, in a line."""
+    """Description of a policy, in a line."""
     if policy in DESCRIPTIONS:
         return DESCRIPTIONS[policy]
     variant = Variant.parse(policy)
@@ -211,7 +211,7 @@ COSTS = {
 
 
 def cost_table(cells: pd.DataFrame) -> Iterator[str]:
-    """What training and acting take, as :func:`~.tables.cell_table` holds it."""
+    """Costs of training and acting, as :func:`~.tables.cell_table` holds it."""
     yield "## What it costs"
     yield (
         "Medians over the cells with the most demonstrations of each task; in brackets the "

@@ -188,7 +188,7 @@ def over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFra
 
 
 def verdict(only_reference: int, only_other: int, p: float) -> str:
-    """What a comparison says of the reference.
+    """Verdict of a comparison on the reference.
 
     Parameters
     ----------

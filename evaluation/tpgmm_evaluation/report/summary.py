@@ -45,7 +45,7 @@ MAPS = 4
 
 @dataclass(frozen=True)
 class Task:
-    """What stands in the folder of an environment.
+    """Content of the folder of an environment.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What ``lerobot-train`` drives: demonstrations gathered, losses reported, the model fitted."""
+"""Training by ``lerobot-train``: demonstrations gathered, losses reported, the model fitted."""

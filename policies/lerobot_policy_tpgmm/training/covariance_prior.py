@@ -77,7 +77,7 @@ class CovariancePrior:
         return cls(regularization, strengths)
 
     def penalty(self, triangles: Sequence[Tensor]) -> Tensor:
-        """What to add to the negative log-likelihood per point of each component, (K,).
+        """Penalty added to the negative log-likelihood per point of each component, (K,).
 
         ``tr(Sigma^-1 Lambda) / 2``, and ``l / (1 - l)`` times the Kullback-Leibler divergence
         from the diagonal D of the covariance C given time to C itself,

@@ -167,7 +167,7 @@ class EpochRecorder:
         return sum(len(self.ranges[number]) for number in self.episodes)
 
     def __str__(self) -> str:
-        """What is there, and how many steps of training are needed."""
+        """Frames that were gathered, and how many steps of training are needed."""
         n_episodes, n_frames = len(self.episodes), self._expected
         if not n_episodes:
             return "no frame has come yet"

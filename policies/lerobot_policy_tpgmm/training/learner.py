@@ -340,7 +340,7 @@ class Learner:
         ]
 
     def _regularization(self, rows: Tensor, kinematics: Kinematics) -> list[Tensor]:
-        """What EM adds to the diagonals of the covariances of these local data."""
+        """Regularisation that EM adds to the diagonals of covariances of these local data."""
         config = self._config
         moments = ColumnMoments.of(rows.numpy())
         shares = regularization(
@@ -448,7 +448,7 @@ class Learner:
     def _situations(
         self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor
     ) -> dict[str, Tensor]:
-        """What the frames are read from: the beginning of the episode, where it has come."""
+        """Rows that frames are read from: the beginning of the episode, where it has come."""
         rows = {key: batch[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in batch}
         if self._config.control.follow_frames:
             return rows

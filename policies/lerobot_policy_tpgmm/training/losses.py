@@ -1,4 +1,4 @@
-"""What training by gradient minimises: differentiable in the parameters of the mixture."""
+"""Losses of training by gradient, differentiable in the parameters of the mixture."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Adjustment:
         return found
 
     def gain(self, columns: Array) -> tuple[float, Array, Array]:
-        """What another cause would explain, to first order and with the noise left by it.
+        """Gain in likelihood by another cause, to first order and with the noise left by it.
 
         Parameters
         ----------

@@ -178,7 +178,7 @@ def calibrate_cell(
 
 
 class _Task:
-    """What is calibrated, and the poses of targets that each picture tells.
+    """Unknowns of a calibration, and the poses of targets in each picture.
 
     ``views`` has, for each camera and target, the postures and the poses of the target in the
     camera's frame.
@@ -321,7 +321,7 @@ class _Task:
             )
 
     def _missing(self, i: int, j: int) -> str:
-        """What postures lack."""
+        """Variety that postures lack."""
         problem, part = self.problem, self.problem.links[len(self.cameras) + j]
         links, jacobians = problem.placed(problem.nothing)
         used = self.views[i, j][0]

@@ -41,7 +41,7 @@ MOST_UNCERTAIN = 0.003, np.radians(3)
 
 @dataclass(frozen=True)
 class View:
-    """What a camera sees of a target.
+    """View of a target by a camera.
 
     Parameters
     ----------

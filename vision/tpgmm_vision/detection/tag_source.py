@@ -140,7 +140,7 @@ class TagSource:
         return {f: detect(picture) for f, detect in self._detectors.items()}
 
     def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
-        """What all cameras see of a target that are where they were."""
+        """Views of a target by all cameras that are where they were."""
         views = []
         for name, one in self._cameras.items():
             if self._moved[name]:
@@ -199,7 +199,7 @@ class TagSource:
         return max(errors, default=None)
 
     def _said(self, name: str, one: CellCamera, place: Array) -> str:
-        """What is said of a camera that was moved, as far as it is seen now."""
+        """Message about a camera that was moved, as far as it is seen now."""
         by = ""
         for known in self._cell.checks.values():
             seen = self.detections[name][known.target.family]

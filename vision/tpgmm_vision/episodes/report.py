@@ -1,4 +1,4 @@
-"""What was found in the episodes of a tracked set: a table, and a page with pictures."""
+"""Report on the episodes of a tracked set: a table, and a page with pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STYLE = (
 
 @dataclass
 class EpisodeReport:
-    """What was found in an episode.
+    """Results of tracking in an episode.
 
     Parameters
     ----------
