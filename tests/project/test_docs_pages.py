@@ -112,11 +112,11 @@ def check_options(program: str, arguments: list[str]) -> None:
             groups[group] = registry.get_choice_class(options[f"{group}.type"])
     for option in options:
         group, _, field = option.rpartition(".")
-        name, *parts = group.split(".")
-        config = groups[name] if group else of_command[program]
-        for part in parts:
-            config = get_type_hints(config)[part]
-        known = {f.name for f in fields(config)}
+        outer, _, inner = group.partition(".")  # --policy.em.tol
+        kind = groups[outer] if outer else of_command[program]
+        if inner:
+            kind = get_type_hints(kind)[inner]
+        known = {f.name for f in fields(kind)}
         assert field in {*known, "type", "path"}, f"{program} has no option --{option}"
 
 
