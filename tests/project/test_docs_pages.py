@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import typer
@@ -79,16 +80,17 @@ def check_options(program: str, arguments: list[str]) -> None:
     from lerobot.configs.eval import EvalPipelineConfig
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.envs import EnvConfig
-    from lerobot.robots import RobotConfig, so_follower
+    from lerobot.robots import RobotConfig, bi_so_follower, so_follower
     from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
     from lerobot.rollout.inference import InferenceEngineConfig
     from lerobot.scripts.lerobot_record import RecordConfig
-    from lerobot.teleoperators import TeleoperatorConfig, so_leader
+    from lerobot.teleoperators import TeleoperatorConfig, bi_so_leader, so_leader
 
     import lerobot_env_bimanual
     from lerobot_policy_tpgmm import TPGMMConfig
 
-    assert so_follower and so_leader and lerobot_env_bimanual  # they register what pages use
+    assert bi_so_follower and bi_so_leader and lerobot_env_bimanual  # they register
+    assert so_follower and so_leader  # what pages use
     options = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
     of_command = {
         "lerobot-eval": EvalPipelineConfig,
@@ -110,7 +112,11 @@ def check_options(program: str, arguments: list[str]) -> None:
             groups[group] = registry.get_choice_class(options[f"{group}.type"])
     for option in options:
         group, _, field = option.rpartition(".")
-        known = {f.name for f in fields(groups[group] if group else of_command[program])}
+        outer, _, inner = group.partition(".")  # --policy.em.tol
+        kind = groups[outer] if outer else of_command[program]
+        if inner:
+            kind = get_type_hints(kind)[inner]
+        known = {f.name for f in fields(kind)}
         assert field in {*known, "type", "path"}, f"{program} has no option --{option}"
 
 
