@@ -32,10 +32,10 @@ PAGES = [
         *sorted(ROOT.glob("policies/*.md")),
         *sorted(ROOT.glob("docs/**/*.md")),
     )
-    if not {"_build", "gallery", "comparison"} & set(path.relative_to(ROOT).parts)
+    if not {"_build", "gallery"} & set(path.relative_to(ROOT).parts)
 ]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-TARGETS = re.findall(r"^([a-z]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+TARGETS = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
 PROJECTS = {
     project["name"]: project
     for path in (ROOT / "pyproject.toml", *ROOT.glob("*/pyproject.toml"))

@@ -123,7 +123,7 @@ def test_every_command_has_its_help_on_the_page_of_the_command_line():
 
 
 def test_every_formula_is_followed_by_what_computes_and_tests_it():
-    text = (DOCS / "mathematics.md").read_text(encoding="utf-8")
+    text = (DOCS / "explanation" / "mathematics.md").read_text(encoding="utf-8")
     formulas = list(FORMULA.finditer(text))
     assert len(formulas) > 20
     for formula in formulas:
@@ -133,7 +133,7 @@ def test_every_formula_is_followed_by_what_computes_and_tests_it():
 
 def test_ties_lead_to_functions_and_tests_that_exist():
     ties = importlib.import_module("ties")
-    text = (DOCS / "mathematics.md").read_text(encoding="utf-8")
+    text = (DOCS / "explanation" / "mathematics.md").read_text(encoding="utf-8")
     for code, tests in TIES.findall(text):
         assert [name for name in code.split(", ") if not exists(name)] == []
         assert [test for test in tests.split(", ") if not ties.test_exists(test)] == []
