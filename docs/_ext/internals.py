@@ -124,7 +124,7 @@ class Internals(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Have the names documented by autodoc, unless ``internals`` of ``conf.py`` is false."""
+        """Have the names documented by autodoc; ``internals = False`` leaves them out."""
         if not self.config.internals:
             return []
         lines = []
