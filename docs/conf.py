@@ -37,7 +37,6 @@ extensions = [
     "internals",
     "notebooks",
     "picturebook",
-    "report",
     "sitelinks",
     "suite",
     "thumbnails",
