@@ -26,11 +26,11 @@ BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 MEASURE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m tpgmm_evaluation.regressions
 MEASURED := --workers $(WORKERS) $(if $(SMALL),--small) $(if $(ONLY),--only $(ONLY))
 
-.PHONY: help demo compare evidence conditions metaworld bench baseline regressions test oldest newest fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare evidence conditions metaworld bench baseline regressions test oldest newest fuzz mutants lint types docs docs-fast check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 
 demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 	OMP_NUM_THREADS=1 $(BIN)/tpgmm demo --out out/demo
@@ -102,6 +102,9 @@ types: $(VENV)/.installed-test ## Check the type hints
 
 docs: $(VENV)/.installed-test ## Build the documentation; open docs/_build/html/index.html
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+docs-fast: $(VENV)/.installed-test ## Build the pages alone, without gallery, source and internals; docs/_build/fast
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html -t fast docs docs/_build/fast
 
 check: lint types test docs ## All four
 

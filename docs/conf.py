@@ -37,23 +37,18 @@ extensions = [
     "internals",
     "notebooks",
     "picturebook",
-    "report",
     "sitelinks",
     "suite",
     "thumbnails",
     "ties",
     "typelinks",
 ]
-exclude_patterns = [
-    "_build",
-    "_ext",
-    "pictures",
-    "comparison",
-    "images",
-    "paper/*",
-    "gallery/*.py",
-]
-nitpicky = True
+exclude_patterns = ["_build", "_ext", "pictures", "images", "paper/*", "gallery/*.py"]
+FAST = tags.has("fast")  # type: ignore[name-defined]  # noqa: F821  # make docs-fast
+if FAST:
+    extensions.remove("sphinx.ext.viewcode")
+internals = not FAST
+nitpicky = internals  # names that are not documented are no targets
 
 # Pages
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "tasklist"]
@@ -75,6 +70,7 @@ intersphinx_mapping = inventories.write(HERE / "_build" / "inventories")
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "gallery",
+    "plot_gallery": not FAST,
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",
     "within_subsection_order": "FileNameSortKey",

@@ -124,7 +124,9 @@ class Internals(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Have the names documented by autodoc."""
+        """Have the names documented by autodoc; ``internals = False`` leaves them out."""
+        if not self.config.internals:
+            return []
         lines = []
         package = self.arguments[0]
         for module, names in internal_names().items():
@@ -142,5 +144,6 @@ class Internals(SphinxDirective):
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """What Sphinx calls."""
+    app.add_config_value("internals", True, "env", bool)
     app.add_directive("internals", Internals)
     return {"parallel_read_safe": True}

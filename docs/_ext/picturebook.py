@@ -23,6 +23,7 @@ SOURCES = (
     "docs/pictures",
     "tpgmm_torch",
     "datasets/tpgmm_datasets",
+    "evaluation/RESULTS.md",
     "tests/project/test_layers.py",
 )
 

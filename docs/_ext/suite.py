@@ -32,9 +32,9 @@ def section(name: str) -> str:
 def _parts(name: str) -> Iterator[str]:
     task = suite_task(name)
     text = (sys.modules[type(task).__module__].__doc__ or "").strip()
-    title, _, told = text.partition(": ")
+    title, _, rest = text.partition(": ")
     yield f"### {title}"
-    yield told[:1].upper() + told[1:]
+    yield rest[:1].upper() + rest[1:]
     if (IMAGES / f"{name}.webp").is_file():
         yield f"![{title}: three moments of an expert's episode](../images/suite/{name}.webp)"
     objects = ", ".join(f"`{thing}`" for thing in task.objects)

@@ -15,8 +15,10 @@ def crop(app: Sphinx) -> None:
     """Cut each thumbnail of ``gallery_thumbnails`` out of the first picture of its example.
 
     The value is the part that is shown: left, upper, right and lower edge, as shares of the
-    picture.
+    picture. Where examples are not run (``make docs-fast``) there are no pictures.
     """
+    if not app.config.sphinx_gallery_conf["plot_gallery"]:
+        return
     images = Path(app.srcdir) / "gallery" / "images"
     for name, part in app.config.gallery_thumbnails.items():
         with Image.open(images / f"sphx_glr_{name}_001.png") as picture:

@@ -77,7 +77,7 @@ class Ties(SphinxDirective):
             refdomain="py",
             reftype="obj",
             reftarget=target,
-            refwarn=True,
+            refwarn=self.config.nitpicky,
         )
         reference["refdoc"] = self.env.docname
         return reference

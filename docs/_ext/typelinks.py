@@ -94,7 +94,8 @@ def _module_of_value(app: Sphinx, module: str, name: str) -> str | None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """What Sphinx calls."""
-    app.connect("viewcode-follow-imported", _module_of_value)
+    if "sphinx.ext.viewcode" in app.extensions:  # not in make docs-fast
+        app.connect("viewcode-follow-imported", _module_of_value)
     app.connect("config-inited", _types, priority=100)  # before numpydoc
     app.connect("doctree-read", _other_name)
     app.connect("missing-reference", _by_last_part)

@@ -195,7 +195,7 @@ class AbsoluteOrientation(_Orientation):
     geometry : {"quaternion", "tangent"}, default="quaternion"
         What the local coordinates are: the paper's four, or three, a rotation vector in the
         tangent space of the demonstrations' mean, which also serves orientations that lie far
-        apart; see the guide's *Orientations that lie far apart*.
+        apart (:doc:`/howto/operators`).
     path : tuple of (time, w, x, y, z), optional
         Base orientations of the tangent space [s, unit quaternion], as seen from the frame;
         ``fit`` finds them where they are not given.
@@ -240,7 +240,7 @@ class RelativeOrientation(_Orientation):
     geometry : {"quaternion", "tangent"}, default="quaternion"
         What the local coordinates are: the paper's four, or three, a rotation vector in the
         tangent space of the demonstrations' mean, which also serves orientations that lie far
-        apart; see the guide's *Orientations that lie far apart*.
+        apart (:doc:`/howto/operators`).
     path : tuple of (time, w, x, y, z), optional
         Base orientations of the tangent space [s, unit quaternion], as seen from the frame;
         ``fit`` finds them where they are not given.
