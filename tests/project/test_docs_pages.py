@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import typer
@@ -110,7 +111,11 @@ def check_options(program: str, arguments: list[str]) -> None:
             groups[group] = registry.get_choice_class(options[f"{group}.type"])
     for option in options:
         group, _, field = option.rpartition(".")
-        known = {f.name for f in fields(groups[group] if group else of_command[program])}
+        outer, _, inner = group.partition(".")  # --policy.em.tol
+        kind = groups[outer] if outer else of_command[program]
+        if inner:
+            kind = get_type_hints(kind)[inner]
+        known = {f.name for f in fields(kind)}
         assert field in {*known, "type", "path"}, f"{program} has no option --{option}"
 
 
@@ -166,7 +171,8 @@ def test_code_and_commands_of_a_page_run_from_top_to_bottom(
             exec(compile(text, str(page), "exec"), names)
         elif language == "bash":
             for command in text.replace("\\\n", " ").splitlines():
-                run(command)
+                if not command.startswith("#"):
+                    run(command)
         else:
             assert language in ("text", "bibtex"), f"{page} has a block of {language}"
 
