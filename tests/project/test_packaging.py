@@ -238,5 +238,7 @@ def test_the_hosted_workflow_runs_what_ci_runs_on_every_supported_python():
         r"\((\d+), (\d+)\) <= .* < \((\d+), (\d+)\)", (ROOT / "Makefile").read_text()
     )
     assert supported.groups() == ("3", "12", "3", "14")
-    commands = "\n".join(step.get("run", "") for step in workflow["jobs"]["wheels"]["steps"])
+    wheels = workflow["jobs"]["wheels"]
+    assert wheels["strategy"]["matrix"] == check["strategy"]["matrix"]
+    commands = "\n".join(step.get("run", "") for step in wheels["steps"])
     assert "make dist" in commands and "tpgmm --version" in commands
