@@ -1,4 +1,4 @@
-"""Notebooks of the gallery: they begin with how to install, and buttons open them.
+"""Notebooks of the gallery: their first cell installs the package, and buttons open them.
 
 Their Markdown has no roles of Sphinx.
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -43,21 +44,22 @@ def repository() -> str | None:
 
 
 def package(at: str | None) -> str:
-    """What pip is told to install: from the repository, where there is one."""
-    return "tpgmm-torch[cli]" + (f" @ git+https://github.com/{at}" if at else "")
+    """The requirement that pip installs: this version, as an archive or a release.
+
+    GitHub's runners name the commit in ``GITHUB_SHA``.
+    """
+    if at is None:
+        return f"tpgmm-torch[cli]=={version('tpgmm-torch')}"
+    commit = os.environ.get("GITHUB_SHA", "HEAD")
+    return f"tpgmm-torch[cli] @ https://github.com/{at}/archive/{commit}.tar.gz"
 
 
 def first_cell(at: str | None) -> str:
-    """The cell that installs: by itself where hosted, elsewhere after a sign is removed."""
-    install = f"%pip install --quiet '{package(at)}'"
-    if at is None:
-        return (
-            "# Where the package is not installed, remove the sign # of the next line, and run"
-            f" the cell.\n# {install}\n"
-        )
+    """The cell that installs the package where it is missing."""
     return (
         "from importlib.util import find_spec\n\n"
-        f'if find_spec("tpgmm_torch") is None:  # in a hosted service\n    {install}\n'
+        'if find_spec("tpgmm_torch") is None:\n'
+        f"    %pip install --quiet '{package(at)}'\n"
     )
 
 

@@ -1,11 +1,16 @@
-"""Notebooks of the gallery run from the first cell to the last, and can be read."""
+"""Notebooks of the gallery install the package, run to their last cell, and can be read."""
 
 import json
 import os
 import re
+import subprocess
 import sys
+import tarfile
+import tomllib
 from copy import deepcopy
+from importlib.metadata import version
 from pathlib import Path
+from unittest.mock import patch
 from urllib.parse import unquote
 
 import nbformat
@@ -26,6 +31,11 @@ EXECUTED = (
     "plot_08_alignment",
     "plot_11_what_matters",
 )
+PACKAGES = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"][
+    "build"
+]["targets"]["wheel"]["packages"]
+#: The line of a first cell that installs, and the requirement in it.
+PIP = re.compile(r"^    %pip install --quiet '([^']+)'$", re.MULTILINE)
 SCRIPTS = sorted((ROOT / "examples").glob("plot_*.py"))
 
 
@@ -71,7 +81,7 @@ def test_a_notebook_runs_and_shows_a_picture(name, extension, tmp_path, monkeypa
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_notebook_can_be_read(script, extension):
     install, title, *cells = converted(script, extension).cells
-    assert install.source.splitlines()[-1] == "# %pip install --quiet 'tpgmm-torch[cli]'"
+    assert PIP.search(install.source)[1] == f"tpgmm-torch[cli]=={version('tpgmm-torch')}"
     assert title.source.strip().startswith("# ")
     texts = [cell.source for cell in (title, *cells) if cell.cell_type == "markdown"]
     assert sum(text.strip().startswith("## ") for text in texts) >= 2
@@ -113,10 +123,8 @@ def test_buttons_open_what_the_site_publishes(site):
         assert "someone/tpgmm" in opened and "gh-pages" in opened
         assert (out / re.search(r"notebooks/\w+\.ipynb$", opened)[0]).is_file()
     assert "Open in" not in (out / "index.html").read_text()
-    assert (
-        "git+https://github.com/someone/tpgmm"
-        in (out / "binder" / "requirements.txt").read_text()
-    )
+    requirements = (out / "binder" / "requirements.txt").read_text()
+    assert "github.com/someone/tpgmm/archive/" in requirements
 
 
 def test_without_a_public_address_there_are_no_buttons(site):
@@ -125,10 +133,33 @@ def test_without_a_public_address_there_are_no_buttons(site):
     assert not (out / "notebooks").exists()
 
 
-def test_a_hosted_notebook_installs_itself_only_where_it_is_not_installed(extension):
-    cell = extension.first_cell("someone/tpgmm")
-    ran = InteractiveShell.instance().run_cell(cell)
-    ran.raise_error()
-    assert cell.splitlines()[-1].strip() == (
-        "%pip install --quiet 'tpgmm-torch[cli] @ git+https://github.com/someone/tpgmm'"
-    )
+@pytest.mark.parametrize("at", [None, "someone/tpgmm"])
+def test_a_first_cell_installs_nothing_where_the_package_is(extension, at):
+    shell = InteractiveShell.instance()
+    with patch.object(shell, "run_line_magic", side_effect=AssertionError) as magic:
+        shell.run_cell(extension.first_cell(at)).raise_error()
+        absent = extension.first_cell(at).replace('"tpgmm_torch"', '"not_there"')
+        with pytest.raises(AssertionError):
+            shell.run_cell(absent, silent=True).raise_error()
+    magic.assert_called_once()
+
+
+def test_pip_installs_the_archive_that_a_hosted_notebook_names(
+    extension, tmp_path, monkeypatch
+):
+    """The archive is of this tree, in the layout of GitHub's, and on this machine."""
+    monkeypatch.setenv("GITHUB_SHA", "0123abc")
+    requirement = PIP.search(extension.first_cell("someone/tpgmm"))[1]
+    address = "https://github.com/someone/tpgmm/"
+    assert requirement == f"tpgmm-torch[cli] @ {address}archive/0123abc.tar.gz"
+    (tmp_path / "archive").mkdir()
+    with tarfile.open(tmp_path / "archive" / "0123abc.tar.gz", "w:gz") as archive:
+        for path in ("LICENSE", "README.md", "pyproject.toml", *PACKAGES):
+            archive.add(ROOT / path, f"tpgmm-0123abc/{path}")
+    here = requirement.replace(address, f"{tmp_path.as_uri()}/")
+    options = ("--no-deps", "--no-index", "--no-build-isolation", "--target", tmp_path / "site")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", *options, here]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for path in PACKAGES:
+        assert (tmp_path / "site" / Path(path).name / "__init__.py").is_file()

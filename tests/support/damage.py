@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 import torch
 from safetensors.torch import load, save
 
-from lerobot_policy_tpgmm import policy_files
 from tpgmm_torch import persistence
 from tpgmm_torch.exceptions import ModelFileError
 
@@ -208,6 +207,8 @@ def signed_again(damage: Damage) -> Damage:
                 config["digest"] = persistence._digest(config)
                 file.write_text(json.dumps(config))
         with suppress(ModelFileError):  # of files that no digest is made of
+            from lerobot_policy_tpgmm import policy_files  # `make oldest` is without LeRobot
+
             if (root / policy_files.DIGESTS).exists():
                 digests = {n: policy_files._digest(root / n) for n in policy_files.COMPARED}
                 (root / policy_files.DIGESTS).write_text(json.dumps(digests))

@@ -1,6 +1,7 @@
 """``tpgmm sequence``: models joined to one, and to one policy."""
 
-from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+import pytest
+
 from tests.support.command_line import output, refusal
 from tests.support.fetching import skills
 from tpgmm_torch import load, save
@@ -22,6 +23,9 @@ def test_models_are_joined(tmp_path):
 
 
 def test_a_sequence_is_one_policy(dataset, fitted, tmp_path):
+    pytest.importorskip("lerobot")  # `make oldest` is without it
+    from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+
     text, out = f"{fitted[0]} until arrived retry 1", tmp_path / "policy"
     options = "--format", "lerobot", "--dataset", dataset, "--out", out
     output("sequence", text, *options)

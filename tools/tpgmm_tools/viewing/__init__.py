@@ -1,6 +1,6 @@
 """Motions in three dimensions: robot, objects, paths, and where the links may be.
 
-Needs the extra ``view`` (viser). :func:`write_motion` makes one HTML file that opens
+Needs the extra ``cli`` (viser). :func:`write_motion` makes one HTML file that opens
 anywhere, :func:`write_rerun` (extra ``rerun``) a recording; :class:`LiveView` serves the same
 scene, in which objects can be moved by hand.
 """

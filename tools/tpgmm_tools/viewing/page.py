@@ -144,7 +144,7 @@ def viser_server(host: str, port: int) -> Iterator[Any]:
         import viser
     except ImportError as error:
         raise DependencyError(
-            "looking at motions needs viser: pip install 'tpgmm-torch[view]'"
+            "looking at motions needs viser: pip install 'tpgmm-torch[cli]'"
         ) from error
     with redirect_stdout(io.StringIO()):  # it prints, whatever its options say
         server = viser.ViserServer(host=host, port=port, verbose=False)
