@@ -16,6 +16,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
+from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_operators import SelectOperators
@@ -29,6 +30,7 @@ __all__ = [
     "STYLE",
     "figure",
     "legend",
+    "operator_labels",
     "plot_candidates",
     "plot_components",
     "plot_joints",
@@ -107,6 +109,36 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
         axes[-1].set_xlabel("time [s]")
         drawing.suptitle(title, fontsize="medium")
     return drawing
+
+
+def operator_labels(operators: Sequence[Operator]) -> list[str]:
+    """Short names of operators for a legend: links, and the frames that they are seen from.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        Of one model. Where two short names are equal, all are :func:`format_operator`'s.
+
+    Examples
+    --------
+    >>> from tpgmm_torch.operators.text import parse_operator
+    >>> texts = "pose:l_hand@bottle + pose:r_hand@bottle", "canonical"
+    >>> operator_labels([parse_operator(text) for text in texts])
+    ['l_hand, r_hand from bottle', 'joints']
+    """
+    texts = [_label(one) for one in operators]
+    return texts if len({*texts}) == len(texts) else [format_operator(one) for one in operators]
+
+
+def _label(operator: Operator) -> str:
+    parts = getattr(operator, "operators", (operator,))
+    if all(part.links() and part.constrains_joints for part in parts):
+        links, frames = (
+            ", ".join(dict.fromkeys(names))
+            for names in (operator.links(), operator.references())
+        )
+        return f"{links} from {frames}" if frames else links
+    return "joints" if operator == Canonical() else format_operator(operator)
 
 
 def legend(drawing: Figure) -> None:
