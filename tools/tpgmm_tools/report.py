@@ -19,7 +19,7 @@ from sklearn.base import clone
 from tpgmm_tools.hub.model_card import sections
 from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
 from tpgmm_tools.viewing import write_motion
-from tpgmm_tools.viewing.curves import motion_marks
+from tpgmm_tools.viewing.curves import motion_marks, turning_joints
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.checks.summary import UNLIKELY
 from tpgmm_torch.control.rollout import rollout
@@ -41,7 +41,8 @@ NEAR = 0.1
 STYLE = """
 :root{color-scheme:light dark}
 body{font:16px/1.5 system-ui,sans-serif;max-width:60em;margin:auto;padding:1em}
-table{border-collapse:collapse;display:block;overflow-x:auto;margin:1em 0}.n,td:first-child{white-space:nowrap}
+table{border-collapse:collapse;display:block;overflow-x:auto;margin:1em 0}
+.n,td:first-child{white-space:nowrap}
 td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #8884}
 img,iframe{width:100%;border:0;background:#fff}div{overflow-x:auto}img{min-width:40em}
 iframe{height:32em}@media (max-width:40em){iframe{height:48em}}
@@ -216,6 +217,8 @@ def _glance(left_out: Sequence[LeftOut]) -> Iterator[str]:
             f"At '{event}' links are {mm:.2g} mm and {deg:.2g} deg from where an episode that "
             f"was left out has them (median; 90\u00a0% within {most:.2g} mm)."
         )
+    path = np.median([one.path for one in left_out])
+    yield f"Along the path its joints are {path:.3f} rad or m off (root mean square, median)."
     new = [str(one.index) for one in left_out if one.novelty > UNLIKELY]
     if new:
         yield f"Unlike the others, look at them: episodes {', '.join(new)}."
@@ -237,11 +240,9 @@ def _exactness(left_out: Sequence[LeftOut]) -> str:
         rows.append(
             [link, event, f"{mm:.2g} / {mm_90:.2g}", f"{deg:.2g} / {deg_90:.2g}", len(pairs)]
         )
-    path = np.median([one.path for one in left_out])
     text = (
         f"<p>Each of {len(left_out)} episodes was left out once, the model learned from the "
-        "others, and reproduced in its situation: median / 90th percentile. Along the path "
-        f"joints are {path:.3f} rad or m off (root mean square, median).</p>"
+        "others, and reproduced in its situation: median / 90th percentile.</p>"
     )
     return text + (_table(["link", "at", "mm", "deg", "episodes"], rows) if rows else "")
 
@@ -298,11 +299,17 @@ def _joints(
         f"Near is within {NEAR:.0%} of the range, or of the speed.</p>"
     )
     none = ["No joint comes near its limits of position or speed."]
+    if not np.isfinite([low, high, limit]).any():
+        none = ["Limits of the joints are not known: without a robot there are none."]
     return text + _table(head, rows), near or none
 
 
 def _unit(model: TaskParameterizedGMM, joint: int) -> str:
-    return "m" if joint in model.kinematics_.lengths else "rad"
+    """Of a joint; parts of quaternions have none, and joints alone say nothing."""
+    robot = model.kinematics_
+    if not robot.links:
+        return "rad or m"
+    return "m" if joint in robot.lengths else "rad" if joint in turning_joints(robot) else "1"
 
 
 def _obstacles(
@@ -338,7 +345,7 @@ def _demonstrations(left_out: Sequence[LeftOut]) -> str:
             one.index,
             f"{one.novelty:.2f}",
             f"{one.path:.3f}",
-            f"{max((mm for mm, _ in one.errors.values()), default=np.nan):.1f}",
+            max((round(mm, 1) for mm, _ in one.errors.values()), default="-"),
         ]
         for one in left_out
     ]

@@ -17,7 +17,15 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels"]
+__all__ = [
+    "Curve",
+    "Mark",
+    "Panel",
+    "as_html",
+    "motion_marks",
+    "motion_panels",
+    "turning_joints",
+]
 
 #: Of stiffness: the ellipsoids' colour, as both show the covariance.
 STIFFNESS = "#1f77b4"
@@ -137,7 +145,7 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     """
     time = as_array(trajectory.time - trajectory.time[0])
     panels = []
-    if turning := _turning(model.kinematics_):
+    if turning := turning_joints(model.kinematics_):
         matrix = Impedance(model.kinematics_).joints.matrix(trajectory.covariance)
         stiffness = as_array(matrix.diagonal(dim1=-2, dim2=-1)[:, turning].mean(-1))
         title = "stiffness, mean of the joints [N m/rad]"
@@ -164,8 +172,13 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     return panels
 
 
-def _turning(kinematics: Kinematics) -> list[int]:
-    """Coordinates whose stiffness is in N m/rad."""
+def turning_joints(kinematics: Kinematics) -> list[int]:
+    """Indices of joints in rad, as tracked quaternions and lengths are not.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    """
     others = {*kinematics.lengths}
     for start in kinematics.quaternion_starts:
         others.update(range(start, start + 4))
