@@ -300,7 +300,7 @@ def _joints(
     )
     none = ["No joint comes near its limits of position or speed."]
     if not np.isfinite([low, high, limit]).any():
-        none = ["Limits of the joints are not known: without a robot there are none."]
+        none = ["Limits of the joints are not known: no robot was given."]
     return text + _table(head, rows), near or none
 
 

@@ -57,7 +57,10 @@ sys.exit(f"{sorted(heavy)} are imported" if heavy else 0)
         ("fot", "No such command 'fot'"),
         ("fit --out x", "Missing argument"),
         ("fit nowhere --out x", "there is no folder nowhere"),
-        ("fit x --out y --n-components 0", "--n-components must be an int in the range [1, inf)"),
+        (
+            "fit x --out y --n-components 0",
+            "--n-components must be an int in the range [1, inf)",
+        ),
         ("fit x --out y --n-components some", "not 'some'"),
         ("fit x --out y --fusion sum", "--fusion"),
         ("fit x --out y --covariance-type round", "--covariance-type must be one of"),
