@@ -40,7 +40,7 @@ class ColumnInfo(Feature):
     misnamed : str
         Why the names cannot be used.
     low, high : tuple of float or None
-        Range of each value over the episodes without problems; None if there are none.
+        Range of each value over the episodes without problems; None without such an episode.
     """
 
     low: tuple[float, ...] | None = None

@@ -363,7 +363,7 @@ def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str,
     Raises
     ------
     DataError
-        If there are none, or those of both sides.
+        If no name fits, or names of both sides do.
 
     Examples
     --------

@@ -33,9 +33,9 @@ def value_names(
     Returns
     -------
     tuple of str or None
-        A name for each value; None where there are none, or they cannot be used.
+        A name for each value; None if they are missing or cannot be used.
     str
-        Why they cannot be used, empty where they can or there are none.
+        Why they cannot be used; empty if they can, or are missing.
     """
     found = list(_leaves(names)) if names else []
     if not found or (len(found) == 1 < width and found[0][1] in re.split(r"[./]", key)):
@@ -114,7 +114,7 @@ def match_names(
         fits = [name] if name in present else [p for p in present if words(p) == words(name)]
         fits = [fit for fit in fits if fit not in matched]
         if len(fits) != 1:
-            what = f"fits several values, {fits}" if fits else "is none of the values"
+            what = f"fits several values, {fits}" if fits else "is not among the values"
             message = f"{kind} {name!r} {what}; they are called {list(present)}. {remedy}"
             raise DatasetError(message, column=column)
         matched[fits[0]] = name

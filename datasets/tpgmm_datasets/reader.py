@@ -291,7 +291,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     robot : object with ``joint_names`` and ``state(joints)``, optional
         The demonstrations then have its joints in its order, found by name (also if spelled
         in another way, ``kLeftElbow`` or ``l_elbow.pos`` for ``left_elbow_joint``); values
-        of the set that are none of its joints are left out. Without a robot all values are
+        of the set that are not its joints are left out. Without a robot all values are
         taken.
     joints : str, optional
         The feature that holds the joints, or ``"measured"`` (``observation.state``, ``state``
@@ -305,7 +305,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is), ``"lerobot"``
         (degrees, and a gripper's 0 to 100 as the limits of that joint of the robot, else raw)
         or a :class:`Scale`, for all values, or by name or pattern: ``{"*": "deg", "*gripper":
-        "raw"}``. Names come first, then later patterns. ``"auto"`` believes the metadata, else
+        "raw"}``. Names come first, then later patterns. ``"auto"`` takes the metadata's, else
         assumes radians and refuses what cannot be radians.
     calibration : str, Path or mapping of str to these, optional
         LeRobot's calibration file of the robot, for values from -100 to 100 (grippers: 0 to

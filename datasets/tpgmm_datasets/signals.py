@@ -32,7 +32,7 @@ class Signals:
     fps : float
         Steps per second of the demonstrations.
     state_names, action_names, environment_names : tuple of str or None
-        Entries of ``observation.state`` (of the joints' feature, where there is none), of
+        Entries of ``observation.state`` (of the joints' feature, if that is missing), of
         ``action`` and of ``observation.environment_state``; None where the set does not name
         them.
     units : mapping of str to (float, float)
@@ -122,7 +122,7 @@ def _renamed(
     """As somebody calls its values; what names none has the names of the joints in order."""
     names, alike = feature.names, feature.width == source.width
     if feature.misnamed and not (alike and given):
-        message = f"its values cannot be told apart: {feature.misnamed}. {REMEDY}"
+        message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
         raise DatasetError(message, column=feature.key)
     if alike and (names is None or (given and names == source.names)):
         names = given or source.names

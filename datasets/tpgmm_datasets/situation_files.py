@@ -99,4 +99,4 @@ def _check_keys(item: Any, what: str, required: set[str], optional: set[str]) ->
     for key in required - item.keys():
         raise DataError(f"{what} lacks {key!r}")
     for key in item.keys() - required - optional:
-        raise DataError(f"{what} has {key!r}, which is none of {allowed}")
+        raise DataError(f"{what} has {key!r}, which is not among {allowed}")

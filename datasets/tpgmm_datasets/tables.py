@@ -135,7 +135,7 @@ def trajectories_to_frame(
     Raises
     ------
     DataError
-        If there are none, or not as many ``frames``, or two columns would have one name.
+        If the list is empty, or ``frames`` are not as many, or two columns would have one name.
     DependencyError
         If there is no pandas.
     """
@@ -256,7 +256,7 @@ def read_table(path: str | Path) -> pd.DataFrame:
     Raises
     ------
     DataError
-        If there is no such file, or it is none of these.
+        If there is no such file, or it has another suffix.
     DependencyError
         If there is no pandas, or no pyarrow for parquet.
     """
@@ -504,7 +504,7 @@ def _wrenches(part: pd.DataFrame) -> dict[str, Array]:
         for link in links
     }
     if odd := [name for name in columns if name.rpartition(".")[2] not in WRENCH_PARTS]:
-        raise DataError(f"columns {odd} are none of {WRENCH}LINK. and {list(WRENCH_PARTS)}")
+        raise DataError(f"columns {odd} are not {WRENCH}LINK. and {list(WRENCH_PARTS)}")
     return found
 
 

@@ -238,8 +238,8 @@ class Moved(Disturbance):
         On the table, in a random direction [m].
     angle : float, default=20 degrees
         About the vertical, to either side [rad]. Of the directions and sides those are taken
-        that leave the object where the task is meant for; where there are none, both are
-        shortened by tenths until there are.
+        that leave the object where the task is meant for; if none does, both are
+        shortened by tenths until some do.
     seconds : float, default=0
         How long it takes; 0 is a jump.
     moment : float, default=NaN
@@ -392,7 +392,7 @@ class Sagging(_Lasting):
     Parameters
     ----------
     angle : float
-        By so much [rad].
+        How far off [rad].
     """
 
     angle: float = math.radians(2)

@@ -110,7 +110,7 @@ def expert(task: str, robot: str = UPPER_BODY) -> Expert:
     Raises
     ------
     DataError, UnknownNameError
-        If there is none.
+        If it does not exist.
     """
     if task not in EXPERTS:
         raise UnknownNameError("task", task, "the recorder", EXPERTS)
@@ -210,7 +210,7 @@ def record(
     Raises
     ------
     DataError, UnknownNameError
-        If the folder exists, an option is not one of the above, so many demonstrations do not
+        If the folder exists, an option is not one of the above, fewer demonstrations
         succeed, or so few postures show the tags.
     """
     if n < 1:
@@ -273,7 +273,7 @@ def _demonstrate(
     true_poses: bool,
     progress: Callable[[str], None],
 ) -> None:
-    """Record demonstrations until so many succeed."""
+    """Record demonstrations until a number of them succeed."""
     for number in range(ATTEMPTS * n):
         # each has numbers of its own: episode 3 is the same, however many there are
         rng = np.random.default_rng((seed, number))

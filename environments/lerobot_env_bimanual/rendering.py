@@ -40,7 +40,7 @@ def offscreen() -> str | None:
     -------
     str or None
         ``"egl"``, ``"osmesa"`` or what the environment variable MUJOCO_GL names; None, with a
-        warning, if there is none, or without one if MUJOCO_GL is ``disable``.
+        warning, if that is missing, or without one if MUJOCO_GL is ``disable``.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted in ("disable", "disabled", "off", "false", "0"):

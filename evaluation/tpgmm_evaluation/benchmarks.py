@@ -126,7 +126,7 @@ class Benchmark(ABC):
         Raises
         ------
         DataError
-            If so many cannot be recorded.
+            If fewer can be recorded.
         """
 
 

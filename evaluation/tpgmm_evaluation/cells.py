@@ -90,7 +90,7 @@ class Results:
         write_json(self.path(cell), {**content, "checksum": _checksum(content)})
 
     def read(self, cell: Cell) -> dict[str, Any] | None:
-        """The result of a cell; None if there is none."""
+        """The result of a cell; None if it is missing."""
         path = self.path(cell)
         if not path.exists():
             return None

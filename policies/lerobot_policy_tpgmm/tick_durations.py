@@ -40,7 +40,7 @@ class TickDurations:
         timestamps : Tensor of shape (B, 1) or (B,)
             When the present observations were made [s].
         usual : float
-            Of the first tick, before which there is none [s].
+            Of the first tick, which follows no other [s].
 
         Returns
         -------

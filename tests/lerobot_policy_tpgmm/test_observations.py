@@ -47,9 +47,9 @@ def test_units_are_converted_both_ways():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"state": ("a", "b")}, "observation.state.*'c' is none of the values.*state_names="),
+        ({"state": ("a", "b")}, "observation.state.*'c' is not among the values.*state_names="),
         ({"state": ("a", "b")}, r"--policy\.joints='left_\*,right_\*'"),
-        ({"action": ("a", "b")}, "action.*'c' is none.*another robot or data set"),
+        ({"action": ("a", "b")}, "action.*'c' is not among.*another robot or data set"),
         ({"action": ("a", "b", "c", "gripper")}, r"\['gripper'\], which are no joints"),
         ({"state": ("a", "b", "c", "c_joint")}, None),
         ({"state": ("a", "b", "c.pos", "c_joint")}, "'c' fits several values"),

@@ -44,7 +44,7 @@ def test_iteration_reads_an_episode_when_it_comes(root):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"robot": Arm("waist")}, r"joint 'waist' is none of the values.*left_elbow"),
+        ({"robot": Arm("waist")}, r"joint 'waist' is not among the values.*left_elbow"),
         ({"joint_names": {"waist": "x"}}, "joint_names has 'waist'"),
         ({"joint_names": ["a", "b"]}, "3 different names"),
         ({"joint_names": {"left_elbow": "gripper"}}, "3 different names"),

@@ -53,7 +53,7 @@ def test_frames_that_move_may_have_their_own_clock(tmp_path):
         ({"joints": [0, 0]}, "a list of situations"),
         ([[0, 0]], "situation 0: a situation is an object"),
         ([{"joints": [0, 0]}, {"frames": {}}], "situation 1: a situation lacks 'joints'"),
-        ([{"joints": [0, 0], "frame": {}}], "has 'frame', which is none of"),
+        ([{"joints": [0, 0], "frame": {}}], "has 'frame', which is not among"),
         ([{"joints": [0.0]}], r"1 values, the model has 2 joints: \['shoulder', 'elbow'\]"),
         ([{"joints": [0.0, "a"]}], "must be an array of numbers"),
         ([{"joints": [0.0, None]}], "NaN"),

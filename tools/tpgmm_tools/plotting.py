@@ -16,6 +16,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
+from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_operators import SelectOperators
@@ -26,18 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "STYLE",
-    "figure",
-    "legend",
-    "plot_candidates",
-    "plot_components",
-    "plot_joints",
-    "plot_local",
-    "plot_parts",
-    "plot_relevance",
-    "save",
-    "shade",
-]
+    "STYLE", "figure", "legend", "operator_labels", "plot_candidates", "plot_components",
+    "plot_joints", "plot_local", "plot_parts", "plot_relevance", "save", "shade",
+]  # fmt: skip
 
 #: Colours of Okabe and Ito, which readers with any kind of colour vision tell apart.
 BLUE, GREEN, PURPLE, SKY, VERMILION = "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"
@@ -45,12 +37,14 @@ ORANGE = "#E69F00"
 DEMONSTRATION, REPRODUCTION, COMPONENT = "0.15", VERMILION, GREEN
 #: Colour and line of each operator; in grey print, lines differ where colours do not.
 OPERATORS = (
-    (VERMILION, "--"),
-    (BLUE, "-."),
-    (GREEN, ":"),
-    (SKY, (0, (5, 1))),
+    (VERMILION, "--"), (BLUE, "-."), (GREEN, ":"), (SKY, (0, (5, 1))),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1))),
-)
+)  # fmt: skip
+#: Of a small text above a point of the axes.
+ABOVE: dict[str, Any] = {
+    "xytext": (0, 1), "textcoords": "offset points", "ha": "center", "va": "bottom",
+    "fontsize": "x-small", "annotation_clip": False,
+}  # fmt: skip
 #: Matplotlib's settings while :func:`figure` and :func:`save` are at work; for other
 #: pictures beside them, ``matplotlib.style.use(STYLE)``.
 STYLE: dict[str, Any] = {
@@ -109,6 +103,36 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
     return drawing
 
 
+def operator_labels(operators: Sequence[Operator]) -> list[str]:
+    """Short names of operators for a legend: links, and the frames that they are seen from.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        Of one model. Where two short names are equal, all are :func:`format_operator`'s.
+
+    Examples
+    --------
+    >>> from tpgmm_torch.operators.text import parse_operator
+    >>> texts = "pose:l_hand@bottle + pose:r_hand@bottle", "canonical"
+    >>> operator_labels([parse_operator(text) for text in texts])
+    ['l_hand, r_hand from bottle', 'joints']
+    """
+    texts = [_label(one) for one in operators]
+    return texts if len({*texts}) == len(texts) else [format_operator(one) for one in operators]
+
+
+def _label(operator: Operator) -> str:
+    parts = getattr(operator, "operators", (operator,))
+    if all(part.links() and part.constrains_joints for part in parts):
+        links, frames = (
+            ", ".join(dict.fromkeys(names))
+            for names in (operator.links(), operator.references())
+        )
+        return f"{links} from {frames}" if frames else links
+    return "joints" if operator == Canonical() else format_operator(operator)
+
+
 def legend(drawing: Figure) -> None:
     """One legend below all panels, where it hides nothing: each label once.
 
@@ -155,17 +179,8 @@ def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
     """Mark phases on ``axes``: a grey band with its name for each of the ``spans`` [s]."""
     for name, (start, end) in spans.items():
         axes.axvspan(start, end, color="0.9", zorder=0, linewidth=0)
-        axes.annotate(
-            name,
-            ((start + end) / 2, 1),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 1),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize="x-small",
-            color="0.4",
-        )
+        middle, place = ((start + end) / 2, 1), ("data", "axes fraction")
+        axes.annotate(name, middle, xycoords=place, color="0.4", **ABOVE)
 
 
 def plot_joints(
@@ -215,11 +230,8 @@ def plot_joints(
         for event, instant in motion.events.items():
             panel.axvline(instant, color="0.7", linewidth=0.8, zorder=0)
             if panel is panels[0]:
-                place: dict[str, Any] = {
-                    "xy": (instant, 1),
-                    "xycoords": ("data", "axes fraction"),
-                }
-                panel.annotate(event, **place, fontsize="x-small")
+                place = (instant, 1), ("data", "axes fraction")
+                panel.annotate(event, place[0], xycoords=place[1], fontsize="x-small")
     return panels
 
 
@@ -244,18 +256,9 @@ def plot_components(
         variances, directions = np.linalg.eigh(covariance)
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
         small, large = 2 * np.sqrt(variances.clip(min=0))
-        axes.add_patch(
-            Ellipse(
-                mean,
-                large,
-                small,
-                angle=angle,
-                color=COMPONENT,
-                alpha=0.35,
-                zorder=3,
-                label="" if k else "Gaussians, one standard deviation",
-            )
-        )
+        look = {"angle": angle, "color": COMPONENT, "alpha": 0.35, "zorder": 3}
+        label = "" if k else "Gaussians, one standard deviation"
+        axes.add_patch(Ellipse(mean, large, small, label=label, **look))
 
 
 def plot_local(
@@ -281,12 +284,10 @@ def plot_local(
         otherwise. Trajectories may come from other models.
     """
     chosen = model.operators_[operator]
-    shown: list[tuple[Demonstration, dict[str, Any]]] = [
-        (
-            demonstration,
-            {"color": DEMONSTRATION, "linewidth": 0.6, "label": "" if i else "demonstrations"},
-        )
-        for i, demonstration in enumerate(demonstrations)
+    thin: dict[str, Any] = {"color": DEMONSTRATION, "linewidth": 0.6}
+    shown = [
+        (one, {**thin, "label": "" if i else "demonstrations"})
+        for i, one in enumerate(demonstrations)
     ]
     # what a reproduction would feel nobody knows
     for trajectory, frames, style in reproductions if chosen.constrains_joints else ():
@@ -382,16 +383,7 @@ def plot_parts(
             axes.barh(row, end - begin, 0.8, begin, color="0.85" if part % 2 else "0.65")
     for reason, own in zip(segmentation.reasons_, boundaries.T, strict=True):
         axes.plot(own, range(len(own)), ".-", color=REPRODUCTION, linewidth=1.0)
-        axes.annotate(
-            reason.replace(", ", "\n"),
-            (own[0], -0.5),
-            xytext=(0, 2),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize="x-small",
-            annotation_clip=False,
-        )
+        axes.annotate(reason.replace(", ", "\n"), (own[0], -0.5), **ABOVE)
     axes.set_ylim(len(boundaries) - 0.5, -0.5)
     axes.set_ylabel("demonstration")
     axes.set_xlabel("time [s]")

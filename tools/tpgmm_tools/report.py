@@ -7,18 +7,21 @@ import html
 import io
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 from sklearn.base import clone
 
-from tpgmm_tools.hub.model_card import describe
-from tpgmm_tools.plotting import figure, legend, plot_candidates, save
+from tpgmm_tools.hub.model_card import sections
+from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
 from tpgmm_tools.viewing import write_motion
+from tpgmm_tools.viewing.curves import motion_marks, turning_joints
 from tpgmm_torch.atomic import replacing
+from tpgmm_torch.checks.summary import UNLIKELY
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
@@ -26,7 +29,8 @@ from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import joint_rmse, pose_errors
-from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.obstacles import Scene, find_contacts
+from tpgmm_torch.operators.base import of_joints
 
 __all__ = ["LeftOut", "leave_one_out", "write_report"]
 
@@ -37,10 +41,11 @@ NEAR = 0.1
 STYLE = """
 :root{color-scheme:light dark}
 body{font:16px/1.5 system-ui,sans-serif;max-width:60em;margin:auto;padding:1em}
-table{border-collapse:collapse;display:block;overflow-x:auto}
+table{border-collapse:collapse;display:block;overflow-x:auto;margin:1em 0}
+.n,td:first-child{white-space:nowrap}
 td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #8884}
-img,iframe{max-width:100%;width:100%;border:0;background:#fff}iframe{height:32em}
-.near{color:#d55e00;font-weight:bold}
+img,iframe{width:100%;border:0;background:#fff}div{overflow-x:auto}img{min-width:40em}
+iframe{height:32em}@media (max-width:40em){iframe{height:48em}}
 """
 
 
@@ -158,7 +163,8 @@ def write_report(
     title : str, default="tpgmm"
         Of the page.
     **how
-        ``objects`` and ``meshes``, as for :func:`~tpgmm_tools.viewing.write_motion`.
+        ``objects``, ``meshes`` and ``obstacles``, as for
+        :func:`~tpgmm_tools.viewing.write_motion`. What touches obstacles is listed.
 
     Returns
     -------
@@ -173,44 +179,55 @@ def write_report(
             for one in situations
         ]
     joints, near = _joints(model, motions)
-    sections = {
-        "At a glance": _list(_glance(left_out, near)),
-        "The motion": _moving(model, situations[situation], demonstrations, how),
+    touching, touched = _obstacles(model, situations, motions, how.get("obstacles"))
+    card = {name: _rendered(text) for name, text in sections(model).items()}
+    understood, shares, limits, _, learning = card.values()
+    parts = {
+        "At a glance": _list([*_glance(left_out), *near, *touching]),
+        "What was understood": understood + _events(model, motions[situation]),
+        "The motion": _moving(model, situations[situation], demonstrations, title, how),
         "How exact it is": _exactness(left_out),
-        "Who decides, and when": _decides(model, motions[situation]),
+        "Who decides, and when": _decides(model, motions[situation]) + shares,
         "Joints and their limits": joints,
-        "Each demonstration": _demonstrations(left_out, demonstrations),
+        "Obstacles": touched,
+        "Each demonstration": _demonstrations(left_out),
+        "Where it fails": limits,
+        "How it was learned": learning,
     }
-    parts = [f"<h2>{html.escape(name)}</h2>{text}" for name, text in sections.items() if text]
+    text = "".join(f"<h2>{name}</h2>{part}" for name, part in parts.items() if part)
     page = (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
         f'<meta name=viewport content="width=device-width"><style>{STYLE}</style>'
-        f"<h1>{html.escape(title)}</h1>{''.join(parts)}{_described(model)}</html>"
+        f"<h1>{html.escape(title)}</h1>{text}</html>"
     )
     with replacing(path) as new:
         new.write_text(page, encoding="utf-8")
     return left_out
 
 
-def _glance(left_out: Sequence[LeftOut], near: Sequence[str]) -> Iterator[str]:
-    """The sentences that a reader needs first."""
-    worst: dict[str, list[float]] = {}
+def _glance(left_out: Sequence[LeftOut]) -> Iterator[str]:
+    """Errors at events, and episodes that are unlike the others."""
+    at: dict[str, list[tuple[float, float]]] = {}
     for one in left_out:
-        for (_, event), (distance, _) in one.errors.items():
-            worst.setdefault(event, []).append(distance)
-    each = [
-        f"{np.median(distances):.2g} mm at '{event}' (90 %: {np.quantile(distances, 0.9):.2g})"
-        for event, distances in worst.items()
-    ]
-    if each:
+        for (_, event), errors in one.errors.items():
+            at.setdefault(event, []).append(errors)
+    for event, pairs in at.items():
+        (mm, deg), (most, _) = np.quantile(pairs, [0.5, 0.9], axis=0)
         yield (
-            "In situations that were not learned from, hands are off where they were shown by "
-            f"{', '.join(each)}: medians."
+            f"At '{event}' links are {mm:.2g} mm and {deg:.2g} deg from where an episode that "
+            f"was left out has them (median; 90\u00a0% within {most:.2g} mm)."
         )
-    new = [str(one.index) for one in left_out if one.novelty > 1.5]
+    path = np.median([one.path for one in left_out])
+    yield f"Along the path its joints are {path:.3f} rad or m off (root mean square, median)."
+    new = [str(one.index) for one in left_out if one.novelty > UNLIKELY]
     if new:
-        yield f"Unlike the others: demonstrations {', '.join(new)}. Look at them."
-    yield from near or ["No joint comes near its limits of position or speed."]
+        yield f"Unlike the others, look at them: episodes {', '.join(new)}."
+
+
+def _events(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
+    marks = motion_marks(model, trajectory)
+    text = ", ".join(f"{html.escape(one.label)} at {one.time:.2f} s" for one in marks)
+    return f"<p>Events: {text or 'none'}.</p>"
 
 
 def _exactness(left_out: Sequence[LeftOut]) -> str:
@@ -223,13 +240,11 @@ def _exactness(left_out: Sequence[LeftOut]) -> str:
         rows.append(
             [link, event, f"{mm:.2g} / {mm_90:.2g}", f"{deg:.2g} / {deg_90:.2g}", len(pairs)]
         )
-    paths = np.array([one.path for one in left_out])
     text = (
-        f"<p>Each of {len(left_out)} demonstrations was left out once, the model learned from "
-        "the others, and reproduced in its situation. Median / 90 %. Along the path the joints "
-        f"are {np.median(paths):.3f} rad off (root mean square).</p>"
+        f"<p>Each of {len(left_out)} episodes was left out once, the model learned from the "
+        "others, and reproduced in its situation: median / 90th percentile.</p>"
     )
-    return text + _table(["link", "at", "mm", "deg", "of"], rows) if rows else text
+    return text + (_table(["link", "at", "mm", "deg", "episodes"], rows) if rows else "")
 
 
 def _decides(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
@@ -237,15 +252,16 @@ def _decides(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
     moves = np.ptp(as_array(trajectory.joints), axis=0)
     chosen = np.sort(np.argsort(moves)[-DRAWN:])
     drawing = figure(len(chosen), "", height=1.6)
-    labels = [format_operator(one)[:60] for one in model.operators_]
+    labels = [fill(text, 40) for text in operator_labels(of_joints(model.operators_))]
     for axes, joint in zip(drawing.axes, chosen, strict=True):
         name = trajectory.joint_names[joint]
         plot_candidates(axes, trajectory, name, labels)
-        axes.set_ylabel(name, fontsize="small")
+        axes.set_ylabel(f"{name}\n[{_unit(model, int(joint))}]", fontsize="small")
     legend(drawing)
     return (
-        "<p>Each operator's estimate of a joint, with one standard deviation, and the result "
-        f"in black: the operator with the narrow band decides.</p>{_picture(drawing)}"
+        f"<p>The {len(chosen)} joints that move most: each operator's estimate, with a band of "
+        "one standard deviation, and the result in black. The operator with the narrow band "
+        f"decides.</p>{_picture(drawing)}"
     )
 
 
@@ -255,60 +271,99 @@ def _joints(
     """Ranges and speeds of the joints, and sentences about those near their limits."""
     robot, rows, near = model.kinematics_, [], []
     joints = [as_array(one.joints) for one in motions]
-    speeds = [
-        np.abs(np.gradient(one, as_array(motion.time), axis=0)).max(0)
-        for one, motion in zip(joints, motions, strict=True)
-    ]
-    low, high = (as_array(one) for one in (robot.lower, robot.upper))
-    least, most = (
-        np.min([one.min(0) for one in joints], 0),
-        np.max([one.max(0) for one in joints], 0),
+    every = np.concatenate(joints)
+    fastest = np.max(
+        [
+            np.abs(np.gradient(one, as_array(motion.time), axis=0)).max(0)
+            for one, motion in zip(joints, motions, strict=True)
+        ],
+        axis=0,
     )
-    fastest, limit = np.max(speeds, axis=0), as_array(robot.velocity)
+    low, high, limit = map(as_array, (robot.lower, robot.upper, robot.velocity))
     for j, name in enumerate(robot.joint_names):
-        room = min(least[j] - low[j], high[j] - most[j])
+        unit, least, most = _unit(model, j), every[:, j].min(), every[:, j].max()
+        room = min(least - low[j], high[j] - most)
         close = np.isfinite(room) and room < NEAR * (high[j] - low[j])
         fast = fastest[j] > (1 - NEAR) * limit[j]
         if close:
-            near.append(f"{name} comes within {room:.3f} of its limit of position.")
+            near.append(f"{name} comes within {room:.3f} {unit} of its limit.")
         if fast:
-            near.append(
-                f"{name} moves with {fastest[j]:.2f} of at most {limit[j]:.2f} per second."
-            )
+            near.append(f"{name} reaches {fastest[j]:.2f} of {limit[j]:.2f} {unit}/s.")
         rows.append([
-            name, f"{least[j]:.2f} to {most[j]:.2f}", f"{low[j]:.2f} to {high[j]:.2f}",
+            name, unit, f"{least:.2f} to {most:.2f}", f"{low[j]:.2f} to {high[j]:.2f}",
             f"{fastest[j]:.2f}", f"{limit[j]:.2f}", "near" if close or fast else "",
         ])  # fmt: skip
-    head = ["joint", "moves", "may", "fastest", "limit", ""]
-    return "<p>rad or m, and per second, in all demonstrated situations.</p>" + _table(
-        head, rows
-    ), near
+    head = ["joint", "unit", "moves", "may", "fastest", "limit", "limits"]
+    text = (
+        "<p>In the situations of all episodes, within the robot's bounds; speeds per second. "
+        f"Near is within {NEAR:.0%} of the range, or of the speed.</p>"
+    )
+    none = ["No joint comes near its limits of position or speed."]
+    if not np.isfinite([low, high, limit]).any():
+        none = ["Limits of the joints are not known: no robot was given."]
+    return text + _table(head, rows), near or none
 
 
-def _demonstrations(
-    left_out: Sequence[LeftOut], demonstrations: Sequence[Demonstration]
-) -> str:
+def _unit(model: TaskParameterizedGMM, joint: int) -> str:
+    """Of a joint; parts of quaternions have none, and joints alone say nothing."""
+    robot = model.kinematics_
+    if not robot.links:
+        return "rad or m"
+    return "m" if joint in robot.lengths else "rad" if joint in turning_joints(robot) else "1"
+
+
+def _obstacles(
+    model: TaskParameterizedGMM,
+    situations: Sequence[Situation],
+    motions: Sequence[Trajectory],
+    scene: Scene | None,
+) -> tuple[list[str], str]:
+    """A sentence, and what touches what in each motion; nothing without a scene."""
+    if scene is None:
+        return [], ""
+    rows = [
+        [
+            number, one.one, one.other, f"{one.begin:.1f} to {one.end:.1f}",
+            f"{1e3 * one.depth:.0f}",
+        ]
+        for number, (situation, motion) in enumerate(zip(situations, motions, strict=True))
+        for one in find_contacts(
+            scene, motion.time, motion.joints, situation.frames_at(motion.time), model.holds_
+        )
+    ]  # fmt: skip
+    count = len({row[0] for row in rows})
+    said = f"Something touches in {count or 'none'} of {len(motions)} motions."
+    allowed = (f"{one} and {other}: {why}" for (one, other), why in scene.allowed.items())
+    head = ["episode", "what", "touches", "from, to [s]", "by [mm]"]
+    text = f"<p>{said}</p>{_table(head, rows) if rows else ''}"
+    return [said], f"{text}<details><summary>pairs that may</summary>{_list(allowed)}</details>"
+
+
+def _demonstrations(left_out: Sequence[LeftOut]) -> str:
     rows = [
         [
             one.index,
-            f"{demonstrations[one.index].duration:.2f}",
             f"{one.novelty:.2f}",
             f"{one.path:.3f}",
-            f"{max((mm for mm, _ in one.errors.values()), default=np.nan):.1f}",
+            max((round(mm, 1) for mm, _ in one.errors.values()), default="-"),
         ]
         for one in left_out
     ]
     text = (
-        "<p>Novelty is the distance of its situation from the others; about 1 is usual, above "
-        "1.5 it is unlike them.</p>"
+        "<p>Novelty is how far an episode's situation is from the others, in units of the "
+        f"furthest of these; above {UNLIKELY} it is unlike them.</p>"
     )
-    return text + _table(["", "s", "novelty", "path [rad]", "worst event [mm]"], rows)
+    return text + _table(
+        ["episode", "novelty", "path [rad or m]", "worst at an event [mm]"],
+        rows,
+    )
 
 
 def _moving(
     model: TaskParameterizedGMM,
     situation: Situation,
     demonstrations: Sequence[Demonstration],
+    title: str,
     how: Mapping[str, Any],
 ) -> str:
     """The moving picture; nothing for a model without links."""
@@ -316,16 +371,15 @@ def _moving(
         return ""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "motion.html"
-        write_motion(place, model, situation, demonstrations, **how)
+        write_motion(place, model, situation, demonstrations, title=title, **how)
         page = html.escape(place.read_text(encoding="utf-8"), quote=True)
     return f'<iframe title="the motion" loading=lazy srcdoc="{page}"></iframe>'
 
 
-def _described(model: TaskParameterizedGMM) -> str:
-    """What a card says of the model."""
+def _rendered(text: str) -> str:
+    """Markdown as HTML."""
     from markdown_it import MarkdownIt
 
-    text = describe(model).replace("## Measured\n\nNothing was stated.\n\n", "")
     rendered: str = MarkdownIt("commonmark").enable("table").render(text)
     return rendered
 
@@ -334,14 +388,15 @@ def _picture(drawing: Any) -> str:
     buffer = io.BytesIO()
     save(drawing, buffer)  # type: ignore[arg-type]
     data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="candidates of joints over time" src="data:image/png;base64,{data}">'
+    source = f"data:image/png;base64,{data}"
+    return f'<div><img alt="each operator\'s estimate over time" src="{source}"></div>'
 
 
-def _list(lines: Iterator[str]) -> str:
+def _list(lines: Iterable[str]) -> str:
     return f"<ul>{''.join(f'<li>{html.escape(line)}' for line in lines)}</ul>"
 
 
 def _table(head: Sequence[object], rows: Sequence[Sequence[object]]) -> str:
     lines = ["".join(f"<th>{html.escape(str(one))}" for one in head)]
     lines += ["".join(f"<td>{html.escape(str(one))}" for one in row) for row in rows]
-    return f"<table><tr>{'<tr>'.join(lines)}</table>"
+    return f"<table class=n><tr>{'<tr>'.join(lines)}</table>"

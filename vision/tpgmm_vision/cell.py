@@ -184,7 +184,7 @@ class Cell:
         Raises
         ------
         DataError
-            If one has none, or there are none.
+            If one has no pose, or the cell has no camera.
         """
         if not self.cameras:
             raise DataError("the cell has no cameras: tpgmm calibrate camera adds one")

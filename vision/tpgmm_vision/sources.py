@@ -89,7 +89,7 @@ def pose_source(cell: Any, robot: Any = None) -> PoseSource:
     Raises
     ------
     UnknownNameError
-        If there is none of that name.
+        If no source has that name.
     DependencyError
         If it cannot be loaded.
     """

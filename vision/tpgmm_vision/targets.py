@@ -208,7 +208,7 @@ def target_from(entry: Mapping[str, Any], where: str = "a target") -> Target:
     Raises
     ------
     DataError
-        If it is none of these; the message begins with ``where``.
+        If it is another kind; the message begins with ``where``.
     """
     makers: dict[str, Any] = {"tag": tag, "cube": cube, "bundle": bundle}
     kinds = [kind for kind in makers if kind in entry]

@@ -32,6 +32,7 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
+    Hold,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -45,6 +46,7 @@ from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
+from tpgmm_torch.training.hold_detection import with_holds
 
 __all__ = ["BottleExperiment", "bottle_operators"]
 
@@ -128,7 +130,8 @@ class BottleExperiment:
         situations = self.skill.situations(self.n_situations, self.seed + 1000)
 
         self.report(f"learning, K = {self.n_components}")
-        model = self._model(self.n_components).fit(aligned)
+        held = with_holds(aligned, [Hold("bottle", HANDS[0], measure.spans["reach"][1])])
+        model = self._model(self.n_components).fit(held)
         save(model, self.out / "model")
         self.report(f"reproducing, K = {self.n_components}")
         reproductions = _run(model.skill, situations, candidates=True)

@@ -58,5 +58,5 @@ class Phases:
         return [int(last) + 1 for last in torch.floor(ends[:, -1] * self.rate + 1e-9)]
 
     def times(self, steps: int) -> Tensor:
-        """The instants of so many time steps [s]."""
+        """The instants of a number of time steps [s]."""
         return torch.arange(steps, dtype=torch.float64) / self.rate

@@ -145,7 +145,7 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
         given = tuple(robot.joint_names)
     if isinstance(given, Mapping) or given is None:
         if feature.misnamed:
-            message = f"its values cannot be told apart: {feature.misnamed}. {NAME_ALL}"
+            message = f"its values cannot be distinguished: {feature.misnamed}. {NAME_ALL}"
             raise DatasetError(message, check="joints", column=feature.key)
         for name in given or ():
             if name not in (names or ()):

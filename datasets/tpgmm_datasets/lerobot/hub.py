@@ -46,7 +46,8 @@ def local_folder(path: str | Path) -> Path:
     recover(folder)
     if folder.is_dir():
         return folder
-    hint = ""
+    hint = ", but a file: read_table and save_lerobot make a data set of a table"
+    hint *= folder.is_file()
     if isinstance(path, str) and re.fullmatch(REPO_ID, path):
         home = os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")
         recorded = Path(os.environ.get("HF_LEROBOT_HOME", Path(home) / "lerobot")) / path

@@ -161,7 +161,7 @@ class Layout:
         Raises
         ------
         DatasetError
-            If there is none, or it is a video.
+            If it does not exist, or is a video.
         """
         readable = sorted(k for k, f in self.features.items() if not f.is_camera)
         if key not in readable:
@@ -266,7 +266,7 @@ def _feature(key: str, entry: Any) -> Feature:
 
 
 def _numbers(values: Any, count: int) -> bool:
-    """Whether these are so many finite numbers."""
+    """Whether these are finite numbers, as many as wanted."""
     whole = isinstance(values, list) and len(values) == count
     return whole and all(type(one) in (int, float) and math.isfinite(one) for one in values)
 

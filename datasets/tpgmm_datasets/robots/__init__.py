@@ -96,7 +96,7 @@ def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings
     Raises
     ------
     DataError, UnknownNameError
-        If the text is none of these, or as for :meth:`tpgmm_torch.Robot.from_urdf`.
+        If the text has another form, or as for :meth:`tpgmm_torch.Robot.from_urdf`.
 
     Examples
     --------

@@ -80,9 +80,9 @@ class Closing:
     """Decides when two hands close: when both are at the bottle and come no closer.
 
     Both palms have to be within ``reach`` of the bottle's surface, and the farther of the two
-    must not have come closer by more than ``progress`` for ``patience`` seconds. No clock of
+    must not have come closer by more than ``progress`` for ``dwell_time`` seconds. No clock of
     the skill is involved: whoever arrives early or late, or with one hand after the other, is
-    waited for; a hand that passes by is gone before the patience is over. It does not matter
+    waited for; a hand that passes by is gone before that time is over. It does not matter
     how the hands are turned or where along the surface they are: a bad grasp is a grasp.
 
     Parameters
@@ -92,13 +92,13 @@ class Closing:
     progress : float, default=0.0005
         [m]; also bounds how much too far away hands can be that close before they have quite
         arrived.
-    patience : float, default=0.2
+    dwell_time : float, default=0.2
         [s]
     """
 
     reach: float = 0.015
     progress: float = 0.0005
-    patience: float = 0.2
+    dwell_time: float = 0.2
     _nearest: float = field(default=math.inf, init=False)
     _since: float = field(default=0.0, init=False)
 
@@ -122,7 +122,7 @@ class Closing:
             return False
         if gap < self._nearest - self.progress:
             self._nearest, self._since = gap, time
-        return time - self._since >= self.patience - 1e-6  # times are rounded
+        return time - self._since >= self.dwell_time - 1e-6  # times are rounded
 
 
 @dataclass(frozen=True)

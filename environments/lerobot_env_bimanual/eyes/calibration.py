@@ -75,7 +75,7 @@ def varied_postures(
     Raises
     ------
     DataError
-        If so many are not found.
+        If fewer are found.
     """
     scene, before = rig.scene, rig.scene.data.qpos.copy()
     moved, camera = chain_of(rig, link), camera or next(iter(rig.views))

@@ -65,7 +65,7 @@ class Reach:
         Raises
         ------
         DataError
-            If there is none.
+            If it does not exist.
         """
         model, data = self._model, self._data
         goal, tool, upwards = (np.array(one, dtype=float) for one in (target, point, up))

@@ -99,7 +99,7 @@ class BiSo101Scene(SuiteScene):
         joints: NDArray[np.float64],
         table: float = 0.0,
     ) -> None:
-        """Let the arms come to rest where their servos are told to be.
+        """Let the arms come to rest where their servos are commanded.
 
         Parameters
         ----------

@@ -348,7 +348,7 @@ def hands_along(
     progress: Mapping[str, Tensor],
     bow: Tensor,
 ) -> list[Frame]:
-    """Where both hands should be, when so much of each phase is done.
+    """Where both hands should be, when a share of each phase is done.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def hands_along(
 
 
 def moved(pose: Frame, offset: Tensor) -> Frame:
-    """Elsewhere by so much [m], as it is turned."""
+    """The pose, shifted by an offset (3,) [m]."""
     return Frame(pose.position + offset, pose.orientation)
 
 

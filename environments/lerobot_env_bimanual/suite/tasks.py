@@ -29,7 +29,7 @@ def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
     Raises
     ------
     UnknownNameError
-        If there is none.
+        If it does not exist.
     DependencyError
         If the robot's description is in a package that is not installed.
     """

@@ -166,7 +166,7 @@ class Wipe(SuiteTask):
 
 
 def _zigzag(done: Tensor) -> Tensor:
-    """Places (n, 2) in the board's plane, when so much is done [m]."""
+    """Places (n, 2) in the board's plane, when a share of the wiping is done [m]."""
     long, wide = WAY
     # at rest at the beginning and the end, and at each turn along the board
     along = done - torch.sin(2 * math.pi * STROKES * done) / (2 * math.pi * STROKES)

@@ -93,7 +93,7 @@ KINDS: Mapping[str, tuple[float, float, float, float]] = {
     "units": (-1, 1, 1.5, 1.0),  # degrees, or radians taken for degrees
     "flipped": (1, 1, 1.5, 0.5),
     "outliers": (0.05, 1.0, np.inf, 0.0),  # rad
-    "stall": (-0.3, 1.0, 0.1, 1.0),  # s; if negative, the controller is not told
+    "stall": (-0.3, 1.0, 0.1, 1.0),  # s; if negative, the controller does not get it
     "jitter": (0.1, 0.8, np.inf, 1.0),  # standard deviation of the logarithm of dt
     "clock": (0.02, 0.2, 1.5, 1.0),  # share of ticks whose dt is 0, negative or NaN
     "payload": (0.05, 0.35, np.inf, 0.0),  # rad
@@ -132,8 +132,8 @@ class Run:
     rng : numpy.random.Generator
         Of noise.
     seed : int
-    true, told : ndarray of shape (n_ticks,)
-        Durations that pass, and that the controller is told [s].
+    true, given : ndarray of shape (n_ticks,)
+        Durations that pass, and that the controller is given [s].
     """
 
     robot: str
@@ -144,7 +144,7 @@ class Run:
     rng: np.random.Generator
     seed: int = 0
     true: Array = field(init=False)
-    told: Array = field(init=False)
+    given: Array = field(init=False)
 
     def __post_init__(self) -> None:
         usual = 1 / self.rate
@@ -162,8 +162,8 @@ class Run:
                 self.true *= np.where(inside, factor, 1.0)
             elif fault.kind == "clock":
                 wrong |= inside & (rng.random(n) < fault.size)
-        self.told = np.where(unnoticed, usual, self.true)
-        self.told[wrong] = rng.choice([0, -usual, np.nan], wrong.sum())
+        self.given = np.where(unnoticed, usual, self.true)
+        self.given[wrong] = rng.choice([0, -usual, np.nan], wrong.sum())
 
     @property
     def situation(self) -> Scenario:

@@ -52,7 +52,7 @@ def measure(log: Log) -> Measures:
     -------
     mapping of str to float
         ``ticks``; ticks beyond ``position``, ``speed``, ``acceleration`` and ``jerk``, over
-        the durations that were told, ``infinite`` ones, and those with a ``false`` status;
+        the durations that were given, ``infinite`` ones, and those with a ``false`` status;
         ``step``, the greatest speed in units of its bound; ``raised``, whether there was an
         exception; ``open``, whether it neither finished, nor waits at last and names a joint,
         nor is held for readings that last; ``late``, seconds after the skill and all
@@ -82,10 +82,10 @@ def measure(log: Log) -> Measures:
 
 def _rates(ticks: Tick, start: Array, limits: tuple[Array, ...]) -> list[Array]:
     """Speed, acceleration and jerk of each tick, in units of their limits, from rest."""
-    timed = ticks.told > 0  # false where it is not a number
+    timed = ticks.given > 0  # false where it is not a number
     reference = np.concatenate((start[None], ticks.reference))
     jumped = (np.diff(reference, axis=0)[~timed] != 0).any(-1)  # in no time
-    dt = ticks.told[timed]
+    dt = ticks.given[timed]
     before = np.concatenate((dt[:1], dt[:-1]))
     earlier = np.concatenate((before[:1], before[:-1]))
     change = np.diff(np.concatenate((start[None], ticks.reference[timed])), axis=0)
@@ -152,7 +152,7 @@ def false_status(log: Log) -> Mask:
     arm = np.abs(ticks.joints - ticks.shadow)[:, _arm(log)].max(-1)
     away = _lasting((arm > 0.03 + slack) & ~off, ticks.time) > settle
     wrong = np.where(away, ~waiting, wrong)
-    held = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.told > 0)
+    held = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.given > 0)
     return np.where(held, ~(holding | ended | frozen), wrong)
 
 

@@ -30,7 +30,7 @@ class Tick(NamedTuple):
     answer.
     """
 
-    told: Any
+    given: Any
     time: Any
     reference: Any
     joints: Any
@@ -78,13 +78,13 @@ class Log:
         """Arrays of shape (n_ticks, ...)."""
         return Tick(*(np.array(column) for column in zip(*self.rows, strict=True)))
 
-    def step(self, told: float, now: float, joints: Array, load: Array) -> None:
+    def step(self, given: float, now: float, joints: Array, load: Array) -> None:
         """The next reference; nothing happens after the end."""
         if self.error or now > self.done + AFTER_END:
             return
         expected, self.reading = _read(self.run, joints[0], self.reading, now)
         try:
-            command = self._controller.step(told, self.reading, _seen(self.run, now))
+            command = self._controller.step(given, self.reading, _seen(self.run, now))
         except Exception as error:
             self.error, self.done = f"{type(error).__name__}: {error}", now
             return
@@ -92,7 +92,7 @@ class Log:
         self.done = min(self.done, now if self._controller.finished else np.inf)
         ours = self.reference, joints[0], joints[1], load, expected
         answer = self.reading, float(command.time), str(command.status)
-        self.rows.append(Tick(told, now, *ours, *answer))
+        self.rows.append(Tick(given, now, *ours, *answer))
 
 
 def simulate(runs: Sequence[Run]) -> list[Log]:
@@ -113,7 +113,7 @@ def simulate(runs: Sequence[Run]) -> list[Log]:
         now = now + dt
         load = _disturb(runs, now, servos, dt)
         for i, log in enumerate(logs):
-            log.step(runs[i].told[k], now[i], servos.joints[:, i], load[i])
+            log.step(runs[i].given[k], now[i], servos.joints[:, i], load[i])
         if all(log.error or now[i] > log.done + AFTER_END for i, log in enumerate(logs)):
             break
         servos.send(np.array([log.reference for log in logs]))

@@ -92,8 +92,8 @@ def direct(episodes: Sequence[Recorded], longest: float) -> list[Recorded]:
 def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     """Demonstrations at ``pace`` of their speed; the switches that all of them have are events.
 
-    Fingers do not slow down with the hand. Their commands come so much later that they
-    have closed where the experts' had. Switches count from the first: some experts take a
+    Fingers do not slow down with the hand. Their commands come later, so that they have
+    closed where the experts' had. Switches count from the first: some experts take a
     second grip, and others do not need it.
     """
     later = round(CLOSING * (1 - pace) * FPS)
@@ -114,7 +114,7 @@ def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
 
 
 def _closing_later(episode: Recorded, later: int) -> Recorded:
-    """The same, with the wanted opening so many steps later."""
+    """The same, with the wanted opening some steps later."""
     references = episode.references.copy()
     steps = np.arange(len(references))
     references[:, -1] = references[np.maximum(steps - later, 0), -1]
@@ -139,7 +139,7 @@ class TaskParameterized:
         target as fast as Meta-World lets them: at their own pace, what differs from them falls
         behind, and cuts the corners and the depth of a push.
     longest : float
-        What takes more than so many times the shortest demonstration is not learned from.
+        What takes more than this multiple of the shortest demonstration is not learned from.
     steps_per_component : int
         How much of the skill one Gaussian is for, of at least ``fewest``.
     fewest : int

@@ -35,7 +35,7 @@ class NeighboursConfig(ChunkedConfig):
         k, whose actions are weighted by the inverse of the distance.
     time_weight : float
         How many standard deviations of a joint a second counts as; 0 where the time is not
-        told.
+        given.
     environment_weight : float
         What a standard deviation of the objects counts as beside one of the joints.
     n_rows : int

@@ -35,7 +35,7 @@ class Plan:
     root : Path
         The checkout, whose examples, tests and benchmarks are used.
     data : Path
-        The folder of the recordings; they are left out where there is none.
+        The folder of the recordings; they are left out where it is missing.
     workers : int, default=1
         Processes for the rollouts.
     """

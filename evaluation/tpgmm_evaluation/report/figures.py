@@ -134,7 +134,7 @@ def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, 
 def panels_for(
     count: int, *, narrowest: float = 0.0, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, row by row, of at least a width [inch]."""
+    """A figure of panels, row by row, of at least a width [inch]."""
     columns = min(COLUMNS, count)
     rows = math.ceil(count / columns)
     size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)

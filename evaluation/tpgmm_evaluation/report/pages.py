@@ -144,7 +144,7 @@ def listed(values: Iterable[int]) -> str:
 
 
 def uncertainty(trials: int) -> str:
-    """How well a rate is known after so many episodes."""
+    """How well a rate is known after a number of episodes."""
     low, high = wilson(trials // 2, trials)
     return (
         f"With {trials} episodes a rate around one half is known to "
@@ -217,7 +217,7 @@ def cost_table(cells: pd.DataFrame) -> Iterator[str]:
         "Medians over the cells with the most demonstrations of each task; in brackets the "
         "smallest and the largest. An action is everything from the raw observation to the "
         "joint references for one robot, on one thread, median and 99th percentile; policies "
-        "that predict chunks compute one every so many actions, and take these from memory."
+        "that predict chunks compute one for several actions, and take these from memory."
     )
     most = cells.groupby(["env", "policy"]).demonstrations.transform("max")
     cells = cells[cells.demonstrations == most]

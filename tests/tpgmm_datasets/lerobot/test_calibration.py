@@ -97,7 +97,7 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         ("[]", "a calibration is a JSON object of motors"),
         ({"shoulder_pan": {"id": 1}}, "'shoulder_pan' needs whole numbers"),
         ({"shoulder_pan": motor(1, (5, 5))}, "'shoulder_pan' needs whole numbers .* a range"),
-        ({"elbow": motor(1, (0, 9))}, r"the motor 'elbow' is none of the val.*joint_names="),
+        ({"elbow": motor(1, (0, 9))}, r"the motor 'elbow' is not among the val.*joint_names="),
         (
             {"wrist_roll": motor(1, (0, 9))},
             r"no motor for \['shoulder_pan\.pos', 'gripper\.pos'\].*--units shoulder_pan",

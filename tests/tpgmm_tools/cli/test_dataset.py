@@ -177,7 +177,7 @@ def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, gener
     text = output("dataset", "check", tmp_path / "degrees")
     assert "cannot say whether it is plausible: " in text and "not radians" in text
     result = run("dataset", "check", tmp_path / "degrees", "--units", "rad", *robot)
-    assert result.exit_code == 2 and "is none of the values" in result.stderr
+    assert result.exit_code == 2 and "is not among the values" in result.stderr
 
 
 def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, generated):

@@ -8,7 +8,7 @@ import pytest
 from tests.support import skills
 from tests.support.command_line import output, refusal
 from tpgmm_datasets import save_lerobot
-from tpgmm_tools.report import leave_one_out
+from tpgmm_tools.report import leave_one_out, write_report
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.metrics import pose_errors
 from tpgmm_torch.persistence import save
@@ -49,20 +49,54 @@ def test_the_page_has_errors_candidates_limits_and_the_motion(learned):
     page = (folder / "model.html").read_text(encoding="utf-8")
     assert text.endswith(f"in {folder / 'model.html'}\n")
     titles = re.findall("<h2>(.*?)</h2>", page)
-    assert titles[:4] == [
+    assert titles == [
         "At a glance",
+        "What was understood",
         "The motion",
         "How exact it is",
         "Who decides, and when",
+        "Joints and their limits",
+        "Each demonstration",
+        "Where it fails",
+        "How it was learned",
     ]
+    assert "Events: none." in page
     assert "<td>l_hand<td>grasp<td>" in page
     for name, speed in zip(
         model.kinematics_.joint_names, model.kinematics_.velocity, strict=True
     ):
-        assert re.search(f"<td>{name}<td>.*?<td>{float(speed):.2f}<td>", page)
+        assert re.search(f"<td>{name}<td>rad<td>.*?<td>{float(speed):.2f}<td>", page)
     motion = html.unescape(re.search('srcdoc="(.*?)"', page, re.DOTALL)[1])
     assert "viser" in motion and "<title>" in motion
     assert "://" not in re.sub('srcdoc=".*?"', "", page, flags=re.DOTALL)
+
+
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_obstacles_are_drawn_and_what_touches_them_is_listed(learned, tmp_path):
+    folder, _, shown = learned
+    x, y, z = shown[0].frames["bottle"].position.tolist()
+    file = tmp_path / "scene.xml"
+    file.write_text(
+        '<mujoco><worldbody><geom name="far" size="0.1" pos="3 0 0"/><geom name="post" '
+        f'type="cylinder" size="0.05 0.3" pos="{x} {y} {z}"/></worldbody></mujoco>'
+    )
+    common = "--dataset", folder / "dataset", "--alignment", "none", "--most", 3
+    out = tmp_path / "page.html"
+    around = "--obstacles", file, "--visuals"
+    output("report", folder / "model", *common, *around, "--out", out)
+    page = out.read_text(encoding="utf-8")
+    touched = re.findall(r"<td>(\d)<td>(\w+)<td>(\w+)<td>([\d.]+) to ([\d.]+)<td>(\d+)", page)
+    assert ("0", "r_hand", "post") in {row[:3] for row in touched}
+    assert {row[2] for row in touched} == {"post"}
+    assert f"Something touches in {len({row[0] for row in touched})} of 4 motions." in page
+
+
+def test_joints_alone_have_no_limits_and_no_picture(tmp_path):
+    shown = skills.waves()
+    write_report(tmp_path / "page.html", skills.canonical().fit(shown), shown, most=3)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Limits of the joints are not known" in page and "nan" not in page
+    assert "comes near" not in page and "<iframe" not in page and "<img" in page
 
 
 def test_what_cannot_be_left_out_is_an_error(learned, tmp_path):

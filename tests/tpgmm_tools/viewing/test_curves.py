@@ -32,7 +32,7 @@ def test_panels_are_the_stiffness_and_the_shares_and_the_page_draws_all_of_each(
     for drawn, candidate in zip(shares.curves, trajectory.candidates, strict=True):
         np.testing.assert_allclose(drawn.values, 100 * candidate.share.mean(-1))
     np.testing.assert_allclose(sum(one.values for one in shares.curves), 100)
-    assert shares.curves[1].label == "canonical" and shares.top == 100
+    assert shares.curves[1].label == "joints" and shares.top == 100
     page = as_html(panels)
     drawn = re.findall(r'<polyline [^>]*points="([^"]+)"', page)
     for text, one in zip(drawn, [curve, *shares.curves], strict=True):
@@ -59,7 +59,7 @@ def test_tracked_poses_have_shares_but_no_stiffness():
     model = skills.hands()
     [trajectory] = model.predict([skills.new_handling()[0]])
     [panel] = motion_panels(model, trajectory)
-    assert [curve.label.count("left") for curve in panel.curves] == [2, 2]
+    assert [curve.label for curve in panel.curves] == ["left from cup", "right from left"]
 
 
 def test_events_of_the_demonstrations_are_marked_where_they_are(tmp_path):

@@ -85,11 +85,18 @@ def test_objects_are_where_the_situation_has_them_with_their_shapes(bottle):
         MotionScene(model, objects={"mug": cup["cup"]})
 
 
-def test_what_is_held_goes_with_the_hand_and_stays_where_it_is_put():
+@pytest.mark.parametrize("recorded", [False, True])
+def test_what_is_held_goes_with_the_hand_and_stays_where_it_is_put(recorded):
     model = copy.copy(skills.small_bottle())
     model.holds_ = (Hold("bottle", "l_hand", 5.0, 9.0),)
     one = skills.few_bottles()[1]
-    drawing = MotionScene(model, fps=5).draw(Situation.of(one))
+    situation = Situation.of(one)
+    if recorded:  # as somebody else carried it
+        bottle = one.frames["bottle"].expand(one.time.shape)
+        away = torch.stack([0 * one.time, 0 * one.time, (one.time - 5.0).clamp(min=0)], -1)
+        frames = {"bottle": Frame(bottle.position + away, bottle.orientation)}
+        situation = replace(situation, frames=frames)
+    drawing = MotionScene(model, fps=5).draw(situation)
     state = upper_body().state(drawing.trajectory.joints[shown_at(drawing)])
     hand = Frame(state.position("l_hand"), state.orientation("l_hand"))
     poses = torch.from_numpy(drawing.nodes["/frames/bottle"].poses)

@@ -214,7 +214,7 @@ def test_what_cannot_be_is_refused_at_once(tracked, original, cell, tmp_path):
     with pytest.raises(DatasetError, match=r"no pictures \['observation\.images\.top'\]"):
         track_lerobot(original, tmp_path / "out", wrong, ROBOT)
     wrong = written(tmp_path / "joint.json", joint_offsets={"elbow": 0.1})
-    with pytest.raises(DatasetError, match="'elbow' is none of the values"):
+    with pytest.raises(DatasetError, match="'elbow' is not among the values"):
         track_lerobot(original, tmp_path / "out", wrong, ROBOT)
     wrong = written(tmp_path / "robot.json", joints=["shoulder_pan"])
     with pytest.raises(DataError, match="another robot"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from importlib.metadata import EntryPoint, version
@@ -29,7 +30,10 @@ HELP = {
     "app": "Learn and look in the browser: a data set in, a moving picture out.",
     "camera": "Print tags and boards that cameras find.",
     "calibrate": "Find lenses and places of cameras, and joint offsets, by the robot's motion.",
+    "compare": "Compare policies on simulated tasks.",
 }
+#: How scikit-learn names a parameter; on the command line it is an option.
+PARAMETER = re.compile(r"the '(\w+)' parameter of TaskParameterizedGMM")
 #: Extras by the packages that come with them.
 OPTIONAL = dict.fromkeys(("matplotlib", "pandas", "pyarrow"), "cli")
 OPTIONAL |= dict.fromkeys(("cv2", "av"), "vision")
@@ -108,7 +112,11 @@ def explain(error: Exception) -> str | None:
     from tpgmm_torch.exceptions import PlausibilityWarning, TPGMMError
 
     expected = isinstance(error, TPGMMError | OSError | PlausibilityWarning)
-    return str(error) if expected else None
+    return PARAMETER.sub(_option, str(error)) if expected else None
+
+
+def _option(match: re.Match[str]) -> str:
+    return f"--{match[1].replace('_', '-')}"
 
 
 def _say(message: str) -> None:
@@ -119,6 +127,7 @@ app = typer.Typer(
     name="tpgmm",
     cls=Commands,
     add_completion=False,
+    context_settings={"help_option_names": ["--help", "--help-all"]},
     invoke_without_command=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,

@@ -25,6 +25,9 @@ COLUMNS = (
     ("amplitude\nin %", "amplitude error [%]", ("median", "p95"), 1),
 )
 TITLE = "How far off: median / 95th percentile over situations that were not demonstrated"
+CAPTION = """\
+grasp: hands at the bottle; shaking, amplitude: shoulders. K: Gaussians.
+Bold: saved. eqs (1), (2): the form that the paper prints, by its epsilon."""
 #: Names of the methods for those who have not read the paper.
 NAMES = (
     ("information form, ", "TP-GMM, "),
@@ -119,6 +122,7 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
     from rich.table import Table
 
     shown = Table(box=SIMPLE_HEAD, pad_edge=False, title=TITLE, title_justify="left")
+    shown.caption, shown.caption_justify = CAPTION, "left"
     shown.add_column("")
     for heading, *_ in COLUMNS:
         shown.add_column(heading, justify="right")
@@ -148,7 +152,7 @@ def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
     shares = list(metrics["share of information on the shoulders"].values())
     yield (
         f"Before the grasp {100 * shares[0]:.0f} % of what is known about the shoulders comes "
-        f"from the bottle,\nwhile shaking {100 * shares[1]:.0f} % from the joints."
+        f"from the\nbottle, while shaking {100 * shares[1]:.0f} % from the joints."
     )
     ablated = metrics["rows"]["position only"][ORIENTATION]["median"]
     yield f"Without orientations the hands are turned by {ablated:.1f} deg at the grasp."

@@ -70,7 +70,9 @@ class Help:
             yield f"{rest} more options: {path} --help-all"
         paragraphs = f"Example: {self.example}".split("\n\n")
         for paragraph in paragraphs if every else paragraphs[:1]:
-            yield from textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)
+            command = paragraph.startswith("Example")  # a shell goes on behind a backslash
+            lines = textwrap.wrap(paragraph, WIDTH - 2, break_on_hyphens=False)
+            yield from " \\\n  ".join(lines).split("\n") if command else lines
 
 
 class Command(TyperCommand):

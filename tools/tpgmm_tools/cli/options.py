@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "Alignments", "DataOptions", "RobotOptions", "align", "command",
+    "Alignments", "DataOptions", "RobotOptions", "align", "command", "look",
     "options_of", "scene", "wanted",
 ]  # fmt: skip
 
@@ -340,6 +340,26 @@ def align(
         return demonstrations
     aligned: list[Demonstration] = chosen.fit_transform(demonstrations)
     return aligned
+
+
+def look(
+    objects: list[str] | None,
+    meshes: Path | None,
+    obstacles: Path | None,
+    visuals: bool,
+    kinematics: Kinematics,
+    shown: list[Demonstration],
+) -> dict[str, Any]:
+    """Shapes of objects, the folder of meshes, and obstacles, as a view draws them."""
+    from tpgmm_tools.viewing import parse_shape
+    from tpgmm_torch.exceptions import DataError
+
+    if meshes is not None and not meshes.is_dir():
+        raise DataError(f"--meshes needs a folder, got {str(meshes)!r}")
+    pairs = [text.partition("=") for text in objects or ()]
+    drawn = {name: parse_shape(shape) for name, _, shape in pairs}
+    around = obstacles and scene(obstacles, kinematics, visuals, shown)
+    return {"objects": drawn, "meshes": meshes, "obstacles": around}
 
 
 def scene(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -28,12 +27,14 @@ def report(
     most: int = 10,
     object_: list[str] | None = None,
     meshes: Path | None = None,
+    obstacles: Path | None = None,
+    visuals: bool = False,
 ) -> None:
     """Write one HTML page about a model, for yourself and for those who have to trust it.
 
     How exactly it reproduces demonstrations that are left out, at events in mm and degrees;
     which operator decides when; speeds and positions against the robot's limits; how new each
-    demonstration is to the others; the motion in three dimensions.
+    demonstration is to the others; what touches obstacles; the motion in three dimensions.
 
     Parameters
     ----------
@@ -53,6 +54,10 @@ def report(
         What an object looks like, as for 'tpgmm view', repeatable.
     meshes : ``FOLDER``
         The robot's mesh files.
+    obstacles : ``FILE.xml``
+        An MJCF with what stands around, as for 'tpgmm reproduce': what touches it is listed.
+    visuals : bool
+        With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
     import torch
     from rich.console import Console
@@ -60,7 +65,6 @@ def report(
 
     from tpgmm_tools.cli.learning import prepared
     from tpgmm_tools.report import write_report
-    from tpgmm_tools.viewing import parse_shape
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.persistence import load_model
 
@@ -73,11 +77,7 @@ def report(
         raise DataError(
             f"there are {len(shown)} episodes, counted from 0: --situation {situation}"
         )
-    pairs = [text.partition("=") for text in object_ or ()]
-    how: dict[str, Any] = {
-        "objects": {n: parse_shape(s) for n, _, s in pairs},
-        "meshes": meshes,
-    }
+    how = options.look(object_, meshes, obstacles, visuals, robot, shown)
     place = out or Path(f"{model}.html")
     how |= {"situation": situation, "most": most, "title": model.resolve().name}
     console = Console(stderr=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import typer
 
@@ -85,14 +85,12 @@ def view(
     """
     import torch
 
-    from tpgmm_tools.viewing import LiveView, parse_shape, write_motion, write_rerun
+    from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.persistence import load_model
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    if meshes is not None and not meshes.is_dir():
-        raise DataError(f"--meshes needs a folder, got {str(meshes)!r}")
     suffix = SUFFIXES[format_]
     where, place = model, out or Path(f"{model}{suffix}")
     if place.suffix != suffix:
@@ -109,11 +107,9 @@ def view(
         raise DataError(
             f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
         )
-    pairs = [text.partition("=") for text in object_ or ()]
-    objects = {name: parse_shape(shape) for name, _, shape in pairs}
-    how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
-    if obstacles is not None:
-        how["obstacles"] = options.scene(obstacles, fitted.kinematics_, visuals, demonstrations)
+    robot = fitted.kinematics_
+    how = options.look(object_, meshes, obstacles, visuals, robot, demonstrations)
+    how["fps"] = fps
     if live:
         at = {"host": host, "port": port, "first": situation, **how}
         with (

@@ -24,7 +24,7 @@ from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["describe", "model_card"]
+__all__ = ["describe", "model_card", "sections"]
 
 #: Rows of the table of what matters when.
 SPANS = 8
@@ -87,11 +87,23 @@ def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
     measured : mapping of str to object, optional
         As for :func:`model_card`.
     """
-    sections: dict[str, str] = {}
+    chapters = sections(model, measured).items()
+    return "\n\n".join(f"## {title}\n\n{text}" for title, text in chapters)
+
+
+def sections(model: Any, measured: Mapping[str, object] | None = None) -> dict[str, str]:
+    """Text of each section of :func:`describe`, by its title.
+
+    Parameters
+    ----------
+    model, measured
+        As there.
+    """
+    found: dict[str, str] = {}
     whole = model.skill if isinstance(model, TaskParameterizedGMM) else model
     for name, skill in _parts(whole):
         title = f" ({name})" if name else ""
-        sections |= {
+        found |= {
             f"The skill{title}": _skill(skill),
             f"What matters, and when{title}": _influence(skill),
             f"Where it fails{title}": _limits(skill),
@@ -99,8 +111,7 @@ def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
     figures = "Nothing was stated."
     if measured:
         figures = _table(("what", "how much"), measured.items())
-    sections |= {"Measured": figures, "How it was learned": _learning(model)}
-    return "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
+    return found | {"Measured": figures, "How it was learned": _learning(model)}
 
 
 def _parts(skill: Any, name: str = "") -> Iterator[tuple[str, Regression]]:

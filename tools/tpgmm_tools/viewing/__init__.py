@@ -11,12 +11,6 @@ from tpgmm_tools.viewing.scene import MotionScene, ellipsoids
 from tpgmm_tools.viewing.visuals import Shape, link_shapes, parse_shape
 
 __all__ = [
-    "LiveView",
-    "MotionScene",
-    "Shape",
-    "ellipsoids",
-    "link_shapes",
-    "parse_shape",
-    "write_motion",
-    "write_rerun",
-]
+    "LiveView", "MotionScene", "Shape", "ellipsoids", "link_shapes", "parse_shape",
+    "write_motion", "write_rerun",
+]  # fmt: skip

@@ -9,15 +9,23 @@ from itertools import cycle
 
 import numpy as np
 
+from tpgmm_tools.plotting import operator_labels
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.operators.base import of_joints
-from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels"]
+__all__ = [
+    "Curve",
+    "Mark",
+    "Panel",
+    "as_html",
+    "motion_marks",
+    "motion_panels",
+    "turning_joints",
+]
 
 #: Of stiffness: the ellipsoids' colour, as both show the covariance.
 STIFFNESS = "#1f77b4"
@@ -25,13 +33,13 @@ STIFFNESS = "#1f77b4"
 OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
 
 # The time line's position is in the page's first input; without one there is no marker. On a
-# narrow page the curves would hide the robot: there they begin folded.
+# narrow page the curves would hide the robot: there they begin folded, but on a phone, upright.
 FOLLOW = """
 (() => {
-  document.getElementById('curves').open = innerWidth >= 700;
+  document.getElementById('curves').open = innerWidth >= 700 || innerHeight >= 2 * innerWidth;
   const marks = document.querySelectorAll('#curves .now');
   const follow = () => {
-    const clock = parseFloat(document.querySelector('input')?.value);
+    const clock = Math.min(END, parseFloat(document.querySelector('input')?.value));
     for (const mark of marks) {
       mark.setAttribute('visibility', Number.isFinite(clock) ? 'visible' : 'hidden');
       if (Number.isFinite(clock)) mark.setAttribute('transform', `translate(${clock})`);
@@ -137,16 +145,17 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     """
     time = as_array(trajectory.time - trajectory.time[0])
     panels = []
-    if turning := _turning(model.kinematics_):
+    if turning := turning_joints(model.kinematics_):
         matrix = Impedance(model.kinematics_).joints.matrix(trajectory.covariance)
         stiffness = as_array(matrix.diagonal(dim1=-2, dim2=-1)[:, turning].mean(-1))
         title = "stiffness, mean of the joints [N m/rad]"
         top = float(stiffness.max())
         panels.append(Panel(title, time, [Curve("", STIFFNESS, stiffness)], top))
-    decided = zip(of_joints(model.operators_), trajectory.candidates, strict=True)
+    labels = operator_labels(of_joints(model.operators_))
+    decided = zip(labels, trajectory.candidates, strict=True)
     shares = [
-        Curve(format_operator(operator), color, as_array(100 * candidate.share.mean(-1)))
-        for (operator, candidate), color in zip(decided, cycle(OPERATORS), strict=False)
+        Curve(label, color, as_array(100 * candidate.share.mean(-1)))
+        for (label, candidate), color in zip(decided, cycle(OPERATORS), strict=False)
     ]
     panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
     if model.holds_:
@@ -163,8 +172,13 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     return panels
 
 
-def _turning(kinematics: Kinematics) -> list[int]:
-    """Coordinates whose stiffness is in N m/rad."""
+def turning_joints(kinematics: Kinematics) -> list[int]:
+    """Indices of joints in rad, as tracked quaternions and lengths are not.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    """
     others = {*kinematics.lengths}
     for start in kinematics.quaternion_starts:
         others.update(range(start, start + 4))
@@ -193,7 +207,7 @@ def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
     return (
         '<details id="curves" open><summary>curves over time</summary>'
         f'{drawn}<div class="row"><span>0 s</span><span>{end:.1f} s</span></div></details>'
-        f"<script>{FOLLOW}</script>"
+        f"<script>{FOLLOW.replace('END', f'{end:.6g}')}</script>"
     )
 
 

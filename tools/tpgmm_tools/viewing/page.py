@@ -35,7 +35,8 @@ __all__ = ["LiveView", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
-#: The page is light in any browser. On a narrow one the curves go above the legend.
+#: The page is light in any browser. On a narrow one the curves go above the legend; on a phone,
+#: upright, both go below the scene, so that the scene is wide enough for two arms.
 STYLE = """
 #legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
 display:flex;flex-wrap:wrap-reverse;justify-content:space-between;align-items:end;gap:.5em;
@@ -50,9 +51,12 @@ border-bottom:1px solid currentColor}
 #curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
 #curves line{stroke:currentColor;stroke-width:1}
 #curves .mark{stroke-dasharray:3 3;opacity:.6}
+@media (max-aspect-ratio:3/5){#root{height:120vw!important}
+#legend{top:120vw;bottom:auto;left:0;right:0;flex-flow:column;align-items:stretch;gap:0}
+#curves{width:100%}}
 """
 
-Moved = Callable[[str, Frame], None]
+Dragged = Callable[[str, Any], None]
 
 
 def write_motion(
@@ -120,7 +124,7 @@ def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
         "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
     }
     if with_demonstrations:
-        entries["demonstrations"] = "demonstrations"
+        entries["demonstrations"] = "demonstrations; small axes: where objects stood"
     lines = "".join(
         f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
         for kind, text in entries.items()
@@ -159,7 +163,7 @@ def draw(
     scene: Any,
     drawing: Drawing,
     handles: Mapping[str, Any] | None = None,
-    moved: Moved | None = None,
+    dragged: Dragged | None = None,
 ) -> dict[str, Any]:
     """Draw into a viser scene; its nodes by their path.
 
@@ -171,16 +175,15 @@ def draw(
         The motion.
     handles : mapping of str to viser.SceneNodeHandle, optional
         Nodes that are there already, of another motion of the same model.
-    moved : callable, optional
-        Makes objects that stand still movable by hand: called with the name of one and its new
-        pose.
+    dragged : callable, optional
+        Makes objects movable by hand: called with the name of one, and viser's event.
     """
     nodes = dict(handles or {})
     for gone in nodes.keys() - drawing.nodes.keys():
         nodes.pop(gone).remove()
     for path, node in drawing.nodes.items():
         if path not in nodes:
-            nodes[path] = _add_node(scene, path, node, drawing.size, moved)
+            nodes[path] = _add_node(scene, path, node, drawing.size, dragged)
     for path, lines in drawing.lines.items():
         scene.add_line_segments(
             path, points=lines.points, colors=lines.color, thickness=lines.thickness,
@@ -223,12 +226,12 @@ def place(handle: Any, pose: Array) -> None:
     handle.position, handle.wxyz = pose[:3], pose[3:]
 
 
-def _add_node(scene: Any, path: str, node: Node, size: float, moved: Moved | None) -> Any:
+def _add_node(scene: Any, path: str, node: Node, size: float, dragged: Dragged | None) -> Any:
     axes = {"axes_length": node.axes, "axes_radius": 0.03 * node.axes, "origin_radius": 0.0}
-    if moved is not None and node.label and len(node.poses) == 1:
+    if dragged is not None and path.startswith("/frames/"):
         handle = scene.add_transform_controls(path, scale=0.12 * size, disable_sliders=True)
         scene.add_frame(f"{path}/axes", **axes)
-        handle.on_update(partial(_let_go, moved, node.label))
+        handle.on_update(partial(dragged, node.label))
     else:
         handle = scene.add_frame(path, node.axes > 0, **axes)
     if node.label:
@@ -236,11 +239,6 @@ def _add_node(scene: Any, path: str, node: Node, size: float, moved: Moved | Non
     for name, shape in node.solids.items():
         _add_solid(scene, f"{path}/{name}", shape)
     return handle
-
-
-def _let_go(moved: Moved, name: str, event: Any) -> None:
-    if event.phase == "end":
-        moved(name, Frame(event.target.position, event.target.wxyz))
 
 
 def _add_solid(scene: Any, path: str, shape: Shape) -> None:
@@ -278,10 +276,10 @@ def _set_view(server: Any, drawing: Drawing) -> None:
 class LiveView:
     """Serve motions to a browser; a context manager.
 
-    The page has a time line, a choice of situations, and a handle on every object that stands
-    still: where it is let go, the skill is reproduced again. With "controller", a
-    :class:`Controller` leads the robot instead: objects can be moved meanwhile, and the robot
-    be held.
+    The page has a time line, a choice of situations, and a handle on every object: where that
+    is let go, the object stands from then on, and the skill is reproduced again. With
+    "controller", a :class:`Controller` leads the robot instead: objects can be moved meanwhile,
+    and the robot be held.
 
     Parameters
     ----------
@@ -333,6 +331,7 @@ class LiveView:
         self._model, self._situations = model, list(situations)
         self._scene = MotionScene(model, demonstrations, **how)
         self._handles: dict[str, Any] = {}
+        self._dragged = ""
         self._controller: Controller | None = None
         self.command: Command | None = None
         self.statuses: list[str] = []
@@ -428,9 +427,7 @@ class LiveView:
     def _reproduce(self, situation: Situation) -> None:
         with self._lock:
             self.situation, self.drawing = situation, self._scene.draw(situation)
-            self._handles = draw(
-                self.server.scene, self.drawing, self._handles, self.move_frame
-            )
+            self._handles = draw(self.server.scene, self.drawing, self._handles, self._drag)
             trajectory = self.drawing.trajectory
             marks = motion_marks(self._model, trajectory)
             self._marks.content = "  \n".join(f"{m.time:.1f} s: {m.label}" for m in marks)
@@ -441,7 +438,8 @@ class LiveView:
         """Show an instant, in seconds since the start; after the end that is the start."""
         with self._lock:
             self.clock = clock if clock <= self.drawing.time[-1] else 0.0
-            move(self._handles, self.drawing.nodes, self.drawing.picture(self.clock))
+            nodes = {p: n for p, n in self.drawing.nodes.items() if p != self._dragged}
+            move(self._handles, nodes, self.drawing.picture(self.clock))
             self._slider.value = round(self.clock, 2)
 
     def _add_controls(self, gui: Any, first: int) -> None:
@@ -457,6 +455,11 @@ class LiveView:
             chosen.on_update(lambda event: self.show(int(event.target.value)))
         self._slider.on_update(self._slid)
         self._run.on_update(self._switched)
+
+    def _drag(self, name: str, event: Any) -> None:
+        self._dragged = "" if event.phase == "end" else event.target.name
+        if not self._dragged:
+            self.move_frame(name, Frame(event.target.position, event.target.wxyz))
 
     def _slid(self, event: Any) -> None:
         if event.client is not None:  # moved by hand, not by the clock

@@ -17,12 +17,12 @@ from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.obstacles import Shape as Obstacle
+from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = [
@@ -251,13 +251,24 @@ class MotionScene:
     def _object_poses(
         self, frames: Mapping[str, Frame], state: RobotState, steps: Tensor, time: Tensor
     ) -> Iterator[tuple[str, Array]]:
-        holds = {hold.frame: hold for hold in self.model.holds_}
-        for name, frame in frames.items():
-            if name in holds and not frame.batch_shape:
-                yield name, _carried(holds[name], frame, state, as_array(time)[steps])
-            else:
-                poses = _poses(frame.position, frame.orientation)
-                yield name, poses[steps.numpy()] if frame.batch_shape else poses[None]
+        """Poses (F, 7) or (1, 7): recorded ones until an object is held, then its link's."""
+        shown = {name: f[steps] if f.batch_shape else f for name, f in frames.items()}
+        holds = [one for one in self.model.holds_ if one.frame in frames]
+        taken = {one.frame: one.begin for one in reversed(holds)}
+        instants = time[steps]
+        rows = {
+            name: int((instants < at).sum().clamp(max=len(steps) - 1))
+            for name, at in taken.items()
+        }
+        still = {name: shown[name].expand(steps.shape)[row] for name, row in rows.items()}
+        carried, _ = held_objects(state, instants, still, holds)
+        for name, frame in shown.items():
+            poses = _poses(frame.position, frame.orientation)
+            if name in rows:
+                pose, free = carried.pose(name), np.arange(len(steps)) < rows[name]
+                there = _poses(pose.position, pose.orientation)
+                poses = np.where(free[:, None], poses, there)
+            yield name, np.atleast_2d(poses)
 
     def _demonstrated_paths(self) -> Iterator[tuple[str, Lines]]:
         for index, link in enumerate(self._links if self._shown else ()):
@@ -314,19 +325,6 @@ def _segments(time: Tensor, path: Array) -> Array:
         even = np.linspace(instants[0], instants[-1], POINTS)
         path = np.asarray(CubicSpline(instants, path)(even))
     return np.stack((path[:-1], path[1:]), axis=1)
-
-
-def _carried(hold: Hold, frame: Frame, state: RobotState, time: Array) -> Array:
-    """Poses (F, 7) of an object that stands at a frame until a link takes it along."""
-    link = Frame(state.position(hold.link), state.orientation(hold.link))
-    poses = np.tile(_poses(frame.position, frame.orientation), (len(time), 1))
-    [held] = np.nonzero((time >= hold.begin) & (time <= hold.end))
-    if len(held):
-        in_link = frame.seen_from(link[int(held[0])])
-        moved = link[torch.from_numpy(held)].compose(in_link.expand((len(held),)))
-        poses[held] = _poses(moved.position, moved.orientation)
-        poses[held[-1] :] = poses[held[-1]]
-    return poses
 
 
 def _poses(positions: Tensor, orientations: Tensor) -> Array:

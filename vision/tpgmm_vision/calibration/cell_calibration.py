@@ -79,8 +79,8 @@ class CellCalibration:
     unknown : tuple of str
         Joints whose offset cannot be known, which is then 0.
     position_errors, angle_errors : ndarray of shape (n_errors,)
-        Of pictures left out: between where a camera sees a target, and where the robot believes
-        that its hand holds it [m, rad].
+        Of pictures left out: between where a camera sees a target, and where its hand has it by
+        the joints [m, rad].
     joint_noise : float
         Standard deviation of what is left [rad].
     problems : tuple of str

@@ -94,7 +94,7 @@ def calibrate_camera(
     if len(views) < LEAST_PICTURES:
         raise DataError(
             f"{len(views)} of {len(pictures)} pictures show the board, {LEAST_PICTURES} are "
-            f"needed, 20 are good; there is none in {without}: are columns, rows and family "
+            f"needed, 20 are good; it is missing in {without}: are columns, rows and family "
             "those of the print, and is it flat, whole, sharp and lit evenly?"
         )
     size = next(iter(sizes.values()))

@@ -34,7 +34,7 @@ def board_pictures(source: Path) -> dict[str, Picture]:
     Raises
     ------
     DataError
-        If there are none.
+        If there is no picture in it.
     """
     found, step = dict[str, Picture](), 1
     if source.is_dir():

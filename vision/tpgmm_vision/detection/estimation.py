@@ -1,4 +1,4 @@
-"""The pose of a target from the corners of its tags, its uncertainty, or why there is none.
+"""The pose of a target from the corners of its tags, its uncertainty, or why it is unknown.
 
 A flat tag that is seen from the front has two poses that explain its corners nearly as well.
 All such hypotheses of all tags are fitted to all corners by Gauss-Newton; a pose is only valid

@@ -60,7 +60,7 @@ def embodiment(name: str) -> Embodiment:
     Raises
     ------
     UnknownNameError
-        If there is none.
+        If it does not exist.
     DependencyError
         If its description is in a package that is not installed.
     """
