@@ -114,6 +114,7 @@ html_show_sourcelink = False
 toc_object_entries_show_parents = "hide"
 # pages without siblings have nothing to navigate
 html_sidebars = {page.stem: [] for page in HERE.glob("*.md")}
+html_context = {"default_mode": "auto"}
 html_theme_options = {
     "navigation_with_keys": False,
     "header_links_before_dropdown": 8,

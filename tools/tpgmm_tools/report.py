@@ -282,17 +282,19 @@ def _joints(
     low, high, limit = map(as_array, (robot.lower, robot.upper, robot.velocity))
     for j, name in enumerate(robot.joint_names):
         unit, least, most = _unit(model, j), every[:, j].min(), every[:, j].max()
-        room = min(least - low[j], high[j] - most)
+        room = float(min(least - low[j], high[j] - most))
         close = np.isfinite(room) and room < NEAR * (high[j] - low[j])
         fast = fastest[j] > (1 - NEAR) * limit[j]
         if close:
-            near.append(f"{name} comes within {room:.3f} {unit} of its limit.")
+            how = "comes within" if room >= 0 else "goes beyond its limit, by"
+            end = " of its limit" * (room >= 0)
+            near.append(f"{name} {how} {abs(room):.3f} {unit}{end}.")
         if fast:
             near.append(f"{name} reaches {fastest[j]:.2f} of {limit[j]:.2f} {unit}/s.")
-        rows.append([
-            name, unit, f"{least:.2f} to {most:.2f}", f"{low[j]:.2f} to {high[j]:.2f}",
-            f"{fastest[j]:.2f}", f"{limit[j]:.2f}", "near" if close or fast else "",
-        ])  # fmt: skip
+        texts = f"{low[j]:.2f} to {high[j]:.2f}", f"{fastest[j]:.2f}", f"{limit[j]:.2f}"
+        known = (text.replace("inf", "\u221e") for text in texts)
+        said = "near" if close or fast else ""
+        rows.append([name, unit, f"{least:.2f} to {most:.2f}", *known, said])
     head = ["joint", "unit", "moves", "may", "fastest", "limit", "limits"]
     text = (
         "<p>In the situations of all episodes, within the robot's bounds; speeds per second. "

@@ -343,6 +343,7 @@ class LiveView:
             self._add_controls(self.server.gui, first)
             self.show(first)
             _set_view(self.server, self.drawing)
+            self.server.on_client_connect(self._step_back)
             self._resources = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -455,6 +456,12 @@ class LiveView:
             chosen.on_update(lambda event: self.show(int(event.target.value)))
         self._slider.on_update(self._slid)
         self._run.on_update(self._switched)
+
+    def _step_back(self, client: Any) -> None:
+        """See both arms on a page that is higher than wide, as on a phone."""
+        camera, middle = client.camera, self.drawing.middle
+        away = (self.server.initial_camera.position - middle) / min(1.0, camera.aspect) ** 0.5
+        camera.position, camera.look_at = middle + away, middle
 
     def _drag(self, name: str, event: Any) -> None:
         self._dragged = "" if event.phase == "end" else event.target.name
