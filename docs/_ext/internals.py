@@ -40,6 +40,7 @@ DIRECTIVE = re.compile(r"^\.\. auto(\w+):: ([\w.]+)\n((?:   .*\n)*)", re.MULTILI
 CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 #: The command line has a page of its own, of its help.
 NOT_CODE = (
+    "tpgmm_tools.arguments",
     "tpgmm_tools.cli",
     "tpgmm_tools.app.command",
     "tpgmm_vision.commands",

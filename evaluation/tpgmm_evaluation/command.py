@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["app"]

@@ -18,7 +18,7 @@ from lerobot_policy_tpgmm.settings import ControlConfig, EMConfig, FusionConfig,
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import parse_robot
-from tpgmm_tools.cli.learning import Choices, parse_parts
+from tpgmm_tools.arguments.learning import Choices, parse_parts
 from tpgmm_torch import Hold, TaskParameterizedGMM
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError

@@ -34,7 +34,7 @@ from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_datasets.lerobot.columns import WRENCH
-from tpgmm_tools.cli.learning import Choices
+from tpgmm_tools.arguments.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import consistent, read_whole, recover

@@ -38,7 +38,7 @@ from tpgmm_evaluation.metaworld.summary import (
 from tpgmm_evaluation.metaworld.trials import trials
 from tpgmm_evaluation.report.pages import write_page
 from tpgmm_evaluation.report.tables import episode_table, write_table
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["app"]

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from tests.support.command_line import output, refusal, run
-from tpgmm_tools.cli import plugins
+from tpgmm_tools.arguments import plugins
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 
 COMMANDS = ["demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset"]

@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from tpgmm_tools.cli.options import Alignments
+from tpgmm_tools.arguments.options import Alignments
 from tpgmm_torch.alignment.text import METHODS, parse_alignment
 from tpgmm_torch.exceptions import DataError
 

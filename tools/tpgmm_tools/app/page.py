@@ -19,9 +19,9 @@ from tpgmm_datasets.checks.check import check
 from tpgmm_datasets.robots import ROBOTS
 from tpgmm_datasets.tables import trajectories_to_frame, write_table
 from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
+from tpgmm_tools.arguments.learning import prepared
+from tpgmm_tools.arguments.options import RobotOptions, align
 from tpgmm_tools.cli.application import explain
-from tpgmm_tools.cli.learning import prepared
-from tpgmm_tools.cli.options import RobotOptions, align
 from tpgmm_tools.viewing import write_motion
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation

@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tpgmm_tools.cli import dataset, demo, plot, plugins, report, reproduce, sequence, view
+from tpgmm_tools.arguments import plugins
+from tpgmm_tools.cli import dataset, demo, plot, report, reproduce, sequence, view
 
 __all__ = ["app", "explain"]
 

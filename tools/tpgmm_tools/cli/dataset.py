@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo

@@ -16,8 +16,8 @@ from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
-from tpgmm_tools.cli import options
-from tpgmm_tools.cli.learning import (
+from tpgmm_tools.arguments import options
+from tpgmm_tools.arguments.learning import (
     Choices,
     aligner,
     learn,
@@ -25,7 +25,7 @@ from tpgmm_tools.cli.learning import (
     parse_parts,
     prepared,
 )  # fmt: skip
-from tpgmm_tools.cli.plugins import OWN, model_format
+from tpgmm_tools.arguments.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
     from tpgmm_torch.operators import Operator

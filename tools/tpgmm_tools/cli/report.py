@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 
 __all__ = ["app"]
 
@@ -63,7 +63,7 @@ def report(
     from rich.console import Console
     from rich.progress import Progress
 
-    from tpgmm_tools.cli.learning import prepared
+    from tpgmm_tools.arguments.learning import prepared
     from tpgmm_tools.report import write_report
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.persistence import load_model

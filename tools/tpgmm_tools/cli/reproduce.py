@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
     from tpgmm_torch.data.frames import Frame

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import typer
 
-from tpgmm_tools.cli import options
-from tpgmm_tools.cli.plugins import OWN, model_format
+from tpgmm_tools.arguments import options
+from tpgmm_tools.arguments.plugins import OWN, model_format
 
 __all__ = ["app"]
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 
 __all__ = ["app"]
 

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 from rich.progress import Progress
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["app"]

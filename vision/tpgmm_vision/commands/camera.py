@@ -8,7 +8,7 @@ from typing import Literal
 
 import typer
 
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.printing import print_targets
 from tpgmm_vision.targets import DEFAULT_FAMILY, Board

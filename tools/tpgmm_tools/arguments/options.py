@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tpgmm_tools.cli.help import HELP_ALL, Command, Help
+from tpgmm_tools.arguments.help import HELP_ALL, Command, Help
 
 if TYPE_CHECKING:
     from tpgmm_datasets.reader import Recording
@@ -333,7 +333,7 @@ def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
     """Bring ``demonstrations`` onto one clock, by the ``method`` for a ``robot``."""
-    from tpgmm_tools.cli.learning import aligner
+    from tpgmm_tools.arguments.learning import aligner
 
     chosen = aligner(method, robot)
     if chosen is None:

@@ -7,7 +7,7 @@ import typer
 from typer.testing import CliRunner
 
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_tools.cli import options
+from tpgmm_tools.arguments import options
 from tpgmm_torch import TaskParameterizedGMM
 
 

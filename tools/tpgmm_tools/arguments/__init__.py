@@ -1,0 +1,1 @@
+"""Options, help and choices that the commands share."""
