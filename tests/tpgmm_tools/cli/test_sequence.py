@@ -18,8 +18,6 @@ def test_models_are_joined(tmp_path):
     assert load(out).timeout == 1.5
     told = refusal("sequence", f"{tmp_path}/lift, {tmp_path}/home", "--out", tmp_path / "no")
     assert "lift is not a saved model" in told and not (tmp_path / "no").exists()
-    told = refusal("sequence", text, "--out", tmp_path / "no", "--format", "lerobot")
-    assert "--dataset" in told
 
 
 def test_a_sequence_is_one_policy(dataset, fitted, tmp_path):
@@ -27,6 +25,7 @@ def test_a_sequence_is_one_policy(dataset, fitted, tmp_path):
     from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 
     text, out = f"{fitted[0]} until arrived retry 1", tmp_path / "policy"
+    assert "--dataset" in refusal("sequence", text, "--out", out, "--format", "lerobot")
     options = "--format", "lerobot", "--dataset", dataset, "--out", out
     output("sequence", text, *options)
     policy = TPGMMPolicy.from_pretrained(out)

@@ -85,7 +85,7 @@ def with_nan(piece):
         (with_nan, DataError, "batch 2: .*NaN"),
         (lambda piece: piece[:, :4], ShapeError, "batch 2 has 4 columns.* before have 5"),
         (lambda piece: piece[:, 0], DataError, "batch 2: .*2D"),
-        (lambda piece: piece.astype(str) + "x", DataError, "batch 2: .*string"),
+        (lambda piece: np.char.add(piece.astype(str), "x"), DataError, "batch 2: .*string"),
         (lambda piece: None, DataError, "batch 2: "),
     ],
 )
