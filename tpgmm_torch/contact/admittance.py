@@ -12,7 +12,6 @@ operators of this link then agree on moving it by ``d e``, and others do not cha
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -20,8 +19,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.wrenches import Wrenches
@@ -58,9 +57,7 @@ class Admittance:
     release: float = 0.5
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < math.inf:
-                raise DataError(f"{name} of an Admittance is above 0 and finite, got {value!r}")
+        check_positive(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +136,7 @@ class Offsets:
             Of the robots alone.
         frames : mapping of str to Frame
         """
-        steps = [
-            (operator.link, operator.along_axes(-value, state, frames))
-            for operator, value in self.values.items()
-        ]
-        for link, step in steps:
-            state = state.displaced(link, step)
+        for operator, value in self.values.items():
+            axes = operator.directions(state, frames)
+            state = state.displaced(operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2))
         return state

@@ -78,6 +78,9 @@ class Command:
     offset : Tensor of shape (..., n_joints), optional
         What readings exceed positions by, as it is estimated: sag, payload, an encoder that
         slipped [rad or m].
+    torque : Tensor of shape (..., n_joints), optional
+        Of each joint, gravity and the bias of the motion included, from a
+        :class:`~tpgmm_torch.torque.TorqueController` [N m or N].
     """
 
     reference: Tensor
@@ -90,6 +93,7 @@ class Command:
     compute_novelty: Callable[[], Tensor] | None = None
     relocalized: Tensor | None = None
     offset: Tensor | None = None
+    torque: Tensor | None = None
 
     def __repr__(self) -> str:
         return (

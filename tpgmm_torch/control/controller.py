@@ -352,10 +352,7 @@ class Controller:
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
             self._touch(tick)
-            self._follow(tick, *self._reach(tick, self._estimate(tick)))
-        else:
-            assert self.command is not None
-            self._follow(tick, self.command.estimate, self._following.wanted, None)
+        self._move(tick)
         return self._send(tick)
 
     def copy(self) -> Self:
@@ -607,6 +604,14 @@ class Controller:
             not self._trusts,
         )  # fmt: skip
         return self._rounded(joints, shift), None
+
+    def _move(self, tick: _Tick) -> None:
+        """From the estimate to the next references."""
+        if tick.ended is None or not bool(tick.ended.all()):
+            self._follow(tick, *self._reach(tick, self._estimate(tick)))
+        else:
+            assert self.command is not None
+            self._follow(tick, self.command.estimate, self._following.wanted, None)
 
     def _follow(
         self, tick: _Tick, found: Estimate, wanted: Tensor, fitting: Follower | None

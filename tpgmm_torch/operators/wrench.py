@@ -125,20 +125,16 @@ class Wrench(Operator):
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
 
+    def directions(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Tensor:
+        """The axes (..., n_axes, 3) in the base frame."""
+        rotation = quaternions.to_matrix(self.pose(state, frames).orientation)
+        return rotation.mT[..., list(self._axes), :]
+
     def components(
         self, vector: Tensor, state: RobotState | None, frames: Mapping[str, Frame]
     ) -> Tensor:
         """Components (..., n_axes) along the axes, of a vector (..., 3) in the base frame."""
-        turn = quaternions.conjugate(self.pose(state, frames).orientation)
-        return quaternions.rotate(turn, vector)[..., list(self._axes)]
-
-    def along_axes(
-        self, values: Tensor, state: RobotState, frames: Mapping[str, Frame]
-    ) -> Tensor:
-        """The vector in the base frame (..., 3) of values along the axes (..., n_axes)."""
-        local = values.new_zeros(*values.shape[:-1], 3)
-        local[..., list(self._axes)] = values
-        return quaternions.rotate(self.pose(state, frames).orientation, local)
+        return (self.directions(state, frames) @ vector.unsqueeze(-1)).squeeze(-1)
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """The tolerance for each axis; none of the contact."""
