@@ -529,10 +529,9 @@ class Controller:
         readings = torch.nan * reference if tick.joints is None else tick.joints
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
         arrived = self._tensor(self._progress.arrived(*arrays))
-        none = torch.zeros_like(reference[..., 0], dtype=torch.bool)
         assert self._inputs is not None
-        unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
-        unseen |= self._inputs.lost
+        every, poses, lost = torch.ones_like(arrived), self._inputs.poses, self._inputs.lost
+        unseen = {n: lost.get(n, every & (n not in poses)) for n in self._frames}
         return Moment(
             self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
             self.holding, self.contacts, arrived,

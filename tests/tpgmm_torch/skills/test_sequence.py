@@ -123,8 +123,6 @@ def test_a_line_of_text_is_a_sequence():
     assert by_path.names == ("pick", "home")
     for wrong, message in (
         ("pick if held", "'pick if held' .* is not of the form NAME"),
-        ("pick until holds", "a condition is one of"),
-        ("pick until contact:", "a condition is one of"),
         ("home until held", "no object is held by the end"),
         ("pick until free", "no object is free by the end"),
         ("pick retry 1 from home, home", "from itself or from a skill before it"),
@@ -134,7 +132,9 @@ def test_a_line_of_text_is_a_sequence():
             Sequence.parse(wrong, skills())
     for wrong, message in (
         ("lift", "'lift'.*pick"),
-        ("pick until contact:foot", "'foot'.*hand"),
+        ("pick until holds", "'holds'.*arrived"),
+        ("pick until contact:", "'contact:'.*contact:hand"),
+        ("pick until contact:foot", "'contact:foot'.*contact:hand"),
         ("pick retry 1 from lift", "'lift'.*pick"),
     ):
         with pytest.raises(UnknownNameError, match=message):
@@ -145,7 +145,6 @@ def test_a_line_of_text_is_a_sequence():
     ("options", "message"),
     [
         ({"until": ["held"]}, "until has 1 entries for 2 skills"),
-        ({"until": 3}, "a condition is one of"),
         ({"retry": [-1, 0]}, "a number of times"),
         ({"timeout": 0.0}, "a positive fade and timeout"),
         ({"fade": float("nan")}, "a positive fade and timeout"),
@@ -154,3 +153,5 @@ def test_a_line_of_text_is_a_sequence():
 def test_what_makes_no_sequence_is_refused(options, message):
     with pytest.raises(DataError, match=message):
         Sequence((of("pick"), of("home")), **options)
+    with pytest.raises(UnknownNameError, match="condition 3 .* a function"):
+        Sequence((of("pick"), of("home")), until=3)
