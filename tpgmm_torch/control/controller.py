@@ -225,7 +225,9 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
-        self._wrenches, forces = _expected_contacts(skill, start, begin)
+        forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+        contacts = {operator.link: operator.contact for operator in forces}
+        self._wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), contacts)
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
@@ -426,8 +428,7 @@ class Controller:
         self._wrenches = self._wrenches.update(tick.seconds, wrenches)
         if self._inputs is None:
             return ages
-        late = self._wrenches.late(self._inputs.trust.joint_timeout)
-        return {**ages, **late} if isinstance(ages, Mapping) and late else late or ages
+        return {**(ages or {}), **self._wrenches.late(self._inputs.trust.joint_timeout)}
 
     def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
@@ -456,8 +457,7 @@ class Controller:
         before = self._progress
         none: Flags = np.zeros(len(before.time), bool)
         passed = none + np.ravel(tick.seconds)
-        held = [robots for robots in (tick.halted, tick.late) if robots is not None]
-        still: Flags = np.logical_or.reduce([none, *held])
+        still = self._stands(tick)
         tick.obstructed = self._obstruction(passed)
         if not self._trusts and tick.joints is None:
             self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
@@ -507,9 +507,7 @@ class Controller:
             return
         progress, postures = self._progress, self._postures(tick, measured=True)
         passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
-        ready = progress.mode == RUNNING
-        for robots in (tick.halted, tick.late):
-            ready = ready if robots is None else ready & ~robots
+        ready = (progress.mode == RUNNING) & ~self._stands(tick)
         moment = None
         if self._inputs is not None and np.isfinite(self._gates.stop).any():
             moment = self._moment(tick, postures)
@@ -522,6 +520,13 @@ class Controller:
         if back.any():
             self._holds = self._holds.released(back, postures, self._frames)
             self._resume(gates.returned)
+
+    def _stands(self, tick: _Tick) -> Flags:
+        """Robots (B,) without accepted inputs, or whose time did not increase."""
+        none: Flags = np.zeros(len(self._progress.time), bool)
+        return np.logical_or.reduce(
+            [none, *(x for x in (tick.halted, tick.late) if x is not None)]
+        )
 
     def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
         """What the conditions of gates are asked of."""
@@ -547,18 +552,13 @@ class Controller:
         """How far links are moved by the errors of their forces."""
         if self._offsets is None or not self._wrenches.readings:
             return
-        expected, kinematics = self._skill.expected_forces(tick.time), self._skill.kinematics
-        operators, state = (*(one.operator for one in expected), *self._offsets.values), None
-        if any(operator.frame in kinematics.links for operator in operators):
-            state = kinematics.state(self._postures(tick, measured=True))
+        state = self._skill.kinematics.state(self._postures(tick, measured=True))
         passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
-        passed = passed.expand(self.reference.shape[:-1])
-        for robots in (tick.halted, tick.late):
-            if robots is not None:
-                passed = torch.where(self._tensor(robots), 0.0, passed)
+        passed = torch.where(self._tensor(self._stands(tick)), 0.0, passed)
         self._offsets = self._offsets.advance(
-            expected, self._wrenches, state, self.holding.frames, passed
-        )
+            self._skill.expected_forces(tick.time), self._wrenches, state, self.holding.frames,
+            passed,
+        )  # fmt: skip
 
     def _estimate(self, tick: _Tick) -> Estimate:
         """What the skill says."""
@@ -766,14 +766,6 @@ def _rows(array: Array) -> Array:
 
 def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
-
-
-def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> tuple[Wrenches, bool]:
-    """Readings of wrenches before the first, and whether the skill expects forces."""
-    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
-    thresholds = {operator.link: operator.contact for operator in forces}
-    wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), thresholds)
-    return wrenches, bool(forces)
 
 
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:

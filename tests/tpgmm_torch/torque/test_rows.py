@@ -133,7 +133,7 @@ def test_a_force_is_pressed_where_a_position_is_not_known():
     operators = [*POSE.operators, Wrench("tip", "board", axes=(2,))]
     found, mechanics = torque(skill(operators, POSTURE), POSTURE, stiffness=STIFF)
     wrench = mechanics.consistent[7:].numpy() @ found
-    normal = operators[-1].directions(None, FRAMES)[0].numpy()
+    normal = operators[-1].directions(robot().state(POSTURE), FRAMES)[0].numpy()
     assert wrench[:3] @ normal == pytest.approx(8.0, abs=0.3)
     assert np.abs(wrench[3:]).max() < 0.1
 
@@ -170,7 +170,7 @@ def test_a_share_of_contact_weakens_the_force():
     operators, pressed = [*WIPING, Wrench("tip", "board", axes=(2,))], []
     for share in (1.0, 0.5, 0.01):
         found, mechanics = torque(skill(operators, POSTURE, share=share), POSTURE)
-        normal = operators[-1].directions(None, FRAMES)[0].numpy()
+        normal = operators[-1].directions(robot().state(POSTURE), FRAMES)[0].numpy()
         pressed.append(normal @ mechanics.consistent[7:10].numpy() @ found)
     assert pressed[0] > 7 > pressed[1] > 0.1 > pressed[2] > 0
 
