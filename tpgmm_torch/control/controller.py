@@ -228,6 +228,7 @@ class Controller:
         forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
         contacts = {operator.link: operator.contact for operator in forces}
         self._wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), contacts)
+        self._needs_wrench = admittance is not None and bool(forces)
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
@@ -423,7 +424,7 @@ class Controller:
 
     def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
         """Measured wrenches; ages of inputs, with those that are missing too long."""
-        if tick.first and self._trusts and self._offsets is not None and not wrenches:
+        if tick.first and self._trusts and self._needs_wrench and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
         self._wrenches = self._wrenches.update(tick.seconds, wrenches)
         if self._inputs is None:
@@ -737,11 +738,10 @@ LONG_TICK = (
     "dt is more than a second: it is in seconds, not in milliseconds; after a pause of the "
     "loop, the skill goes on as if half a second had passed"
 )
-
-
 NO_WRENCH = (
-    "the skill expects forces, and the first step has no wrench: references follow positions "
-    "alone. Give step(..., wrenches={link: ...}), or Controller(..., admittance=None)"
+    "the skill expects forces, and the first step has no wrench: what is measured corrects "
+    "nothing. Give step(..., wrenches={link: ...}), or do without, Controller(..., "
+    "admittance=None), TorqueGains(integral=0)"
 )
 
 

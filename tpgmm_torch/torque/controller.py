@@ -8,7 +8,6 @@ fades in and out, and its limits.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,9 +19,9 @@ from torch import Tensor
 from tpgmm_torch.contact import Admittance
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.reach import Fade
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
-from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
@@ -49,10 +48,6 @@ FASTEST_PACE = 2.0
 #: damping is of no use at 1 and unstable at 2, and contact takes half of the margin.
 LONGEST_TICK = 0.5
 
-NO_WRENCH = (
-    "the skill expects forces, and the first step has no wrench: forces are not corrected by "
-    "what is measured. Give wrenches={link: (..., 6)}, or TorqueGains(integral=0)"
-)
 LONG_TICK = (
     "a tick is longer than the {:.2g} ms that the damping allows: run at {:.0f} Hz or more, or "
     "with lower TorqueGains"
@@ -69,10 +64,8 @@ class Drive:
         Last known ones.
     sent : Tensor of shape (..., n_joints)
         Torque beside the bias, before limits.
-    offset : Tensor of shape (..., n_joints)
-        Difference from what the skill asked for, when robots began or went on.
-    since : Tensor of shape (...)
-        Time since then [s].
+    fade : Fade
+        Of the difference from what the skill asked for, when robots began or went on.
     stopped : Tensor of bool of shape (...)
         Robots that are held.
     bias : Tensor of shape (..., n_joints)
@@ -90,8 +83,7 @@ class Drive:
 
     joints: Tensor
     sent: Tensor
-    offset: Tensor
-    since: Tensor
+    fade: Fade
     stopped: Tensor
     bias: Tensor
     rate: Tensor
@@ -181,7 +173,6 @@ class TorqueController(Controller):
         if self._inputs is None:
             raise DataError("trust=None follows every reading: torques need trust=Trust(...)")
         self._dynamics, self._gains = dynamics, gains
-        self._blend = float(settings.get("blend", 1.0))
         start, zero = self.reference, torch.zeros_like(self.reference)
         self._local, self._tick, n = None, None, start.shape[-1]
         if self._skill.expected_forces(self.time):
@@ -191,6 +182,7 @@ class TorqueController(Controller):
                     "of one fitted skill, model.skill; run its skills one after the other"
                 )
             self._local = LocalGaussians(self._skill, gains)
+            self._needs_wrench = gains.integral > 0
         effort = getattr(dynamics, "effort", math.inf) if effort is None else effort
         self._effort = torch.as_tensor(effort).to(start)
         if self._effort.shape not in ((), (n,)) or not bool((self._effort > 0).all()):
@@ -205,8 +197,8 @@ class TorqueController(Controller):
         self._stiffness = first.stiffness
         self._compliance = torch.linalg.inv(first.stiffness[..., :n, :n])
         self._drive = Drive(
-            start, zero, zero, none, none == 0, bias, first.rate, none > 0, self.time + none,
-            none,
+            start, zero, Fade.start(zero, float(settings.get("blend", 1.0))), none == 0, bias,
+            first.rate, none > 0, self.time + none, none,
         )  # fmt: skip
 
     def step(
@@ -244,8 +236,6 @@ class TorqueController(Controller):
         ShapeError, UnknownNameError
             As for :meth:`Controller.step`.
         """
-        if self.command is None and self._local and self._gains.integral and not wrenches:
-            warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
         speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
         self._tick, late = None, {**(ages or {}), **self._faults(dt, given, speeds)}
         command = super().step(dt, joints, frames, holds=holds, ages=late, wrenches=wrenches)
@@ -317,16 +307,14 @@ class TorqueController(Controller):
         left = (1 - dt / FADING_TIME).clamp_min(0.0).unsqueeze(-1)
         at_rest = held + left * (last.sent - held)
         # what is sent goes on where it was: the difference fades, as that of postures does
-        begins = last.stopped & ~stopped
-        offset = torch.where(begins.unsqueeze(-1), found.fused - last.sent, last.offset)
-        since = torch.where(begins, 0.0, last.since + dt)
-        share = since / self._blend if self._blend > 0 else torch.ones_like(since)
-        left = 1 - minimum_jerk(share).unsqueeze(-1)
-        sent = torch.where(stopped.unsqueeze(-1), at_rest, found.fused - left * offset)
+        fade = last.fade.again(last.stopped & ~stopped)
+        left_over, fade = fade.advance(last.sent, found.fused, dt, first=True)
+        fused = found.fused if left_over is None else found.fused + left_over
+        sent = torch.where(stopped.unsqueeze(-1), at_rest, fused)
         torque = (bias + sent).clamp(-self._effort, self._effort)
         free = torch.where(~stopped & (bias + sent == torque).all(-1), dt, 0.0)
         self._drive = Drive(
-            joints, sent, offset, since, stopped, bias, rate, ~finite,
+            joints, sent, fade, stopped, bias, rate, ~finite,
             command.time.expand_as(dt), dt, self._integrated(found, free, dt),
         )  # fmt: skip
         return replace(command, estimate=found.estimate, torque=torque)
@@ -335,7 +323,7 @@ class TorqueController(Controller):
         """Of joints and, where forces are expected, links; at first with a new stiffness."""
         jacobian = inertia[..., :0, :]
         if self._local is not None:
-            jacobian = self._local.jacobian(state, self.holding.frames)
+            jacobian = self._local.jacobian(state)
         stiffness = getattr(self, "_stiffness", None)
         return Mechanics.at(inertia, jacobian, velocities, self._gains, stiffness)
 
@@ -372,8 +360,8 @@ class TorqueController(Controller):
         pace = torch.where(dt > 0, (time - last.time) / dt, 0.0).clamp(0.0, FASTEST_PACE)
         rows, forces = [local.rows(time, pace, state, frames, at)], []
         for one in self._skill.expected_forces(time):
-            axes, first = one.operator.directions(state, frames), local.first_row(one.operator)
-            integral = last.integrals.get(one.operator, 0.0)
+            operator, integral = one.operator, last.integrals.get(one.operator, 0.0)
+            axes, first = operator.directions(state, frames), local.first_row(operator.link)
             rows.append(force_row(one, axes, integral, first, at, self._gains))
             forces.append((one, axes))
         fused, covariance = fused_torque(rows, at)

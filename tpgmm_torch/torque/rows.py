@@ -27,18 +27,8 @@ from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.impedance.stiffness import geometric_mean
-from tpgmm_torch.operators import (
-    AbsoluteOrientation,
-    AbsolutePosition,
-    Canonical,
-    Operator,
-    PoseOperator,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-)
+from tpgmm_torch.operators import Canonical, Operator, PoseOperator, Stack
 from tpgmm_torch.operators.base import of_joints
-from tpgmm_torch.operators.pose import linearize_poses
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -53,16 +43,10 @@ __all__ = ["LocalGaussians", "Mechanics", "TorqueRows", "fastest", "force_row", 
 SINGULAR = 1e-3
 #: Precision of the prior ``PRIOR H^-1`` around the torque that holds a robot [1/J].
 PRIOR = 1e-9
-#: Variance that stands for none, of rows between things that no joint moves [m^2, rad^2].
-FREE = 1e12
 #: Smallest share of contact of which a force has an effect.
 LEAST_SHARE = 1e-3
 #: Inverse of the largest mass and inertia of a link that count [1/kg, 1/(kg m^2)].
 LEAST_MOBILITY = 1e-3
-
-#: A link, or an object, that moves; what it is seen from, where that moves too; whether that is
-#: an object that is held.
-Body = tuple[str, str | None, bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +181,8 @@ class LocalGaussians:
     Parameters
     ----------
     skill : Regression
-        With operators of joints, of positions and orientations of links, their stacks, and of
-        forces.
+        With operators of joints, of positions and orientations of links as places or the base
+        see them, their stacks, and of forces.
     gains : TorqueGains
 
     Raises
@@ -213,79 +197,60 @@ class LocalGaussians:
             self._conditionals = Conditionals.stacked(skill.fused)
         self._stack = Stack(*of_joints(skill.operators))
         self._starts = self._stack.quaternion_starts(skill.kinematics)
-        self._bodies: dict[Body, int] = {}
         self._tangents: list[tuple[int, PoseOperator]] = []
-        noise, asked = list[float](), set[int]()
+        noise, links = list[float](), dict[str, None]()
         labels = list[tuple[int, ...]]()  # operator, leaf, block and coordinate
+        for leaf in leaves(skill.operators):
+            links |= dict.fromkeys(leaf.links())
+        self._links, asked = tuple(links), set[int]()
         for expert, operator in enumerate(skill.operators):
             for leaf in leaves([operator]):
-                rows = self._rows(leaf)
+                rows, at = self._rows(leaf), len(labels)
                 asked.update(rows)
                 if isinstance(leaf, Wrench):
                     continue
                 if leaf.rotation_vector_starts(skill.kinematics):
-                    self._tangents.append((len(labels), leaf))  # type: ignore[arg-type]
+                    self._tangents.append((at, leaf))  # type: ignore[arg-type]
                 block = 0 if isinstance(leaf, Canonical) else rows[0]
-                at = len(labels)
                 labels += [(expert, at, block, row) for row in rows]
-                noise += [self._tolerance(leaf, gains)] * len(rows)
+                turns = getattr(leaf, "gain", None) is not None
+                tolerance = gains.frame_turn_tolerance if turns else gains.frame_tolerance
+                noise += [tolerance * bool(leaf.references())] * len(rows)
         expert_of, leaf_of, block_of, self._index = torch.tensor(labels).T.to(like.device)
         same = expert_of == expert_of[:, None]
         # two operators of one stack may both have the position of one link
         apart = (leaf_of != leaf_of[:, None]) & (block_of == block_of[:, None])
         self._same_expert, self._coupled = same.to(like), (same & ~apart).to(like)
-        self._noise = torch.tensor(noise).to(like).square()
-        self._poses = [pose for body in self._bodies for pose in _poses(*body)]
-        n = len(like)
-        rows_of_links = range(n, n + 3 * len(self._poses))
-        self._asked = torch.tensor([[row in asked] for row in rows_of_links]).to(like)
+        self._noise = torch.tensor(noise).to(like).square().diag()
+        behind = range(len(like), len(like) + 6 * len(links))
+        self._asked = torch.tensor([row in asked for row in behind]).to(like)[:, None]
 
     def _rows(self, leaf: Operator) -> list[int]:
         """Where the rows of an operator are among the coordinates of :class:`Mechanics`."""
         if isinstance(leaf, Canonical):
             return list(leaf.columns(self._kinematics.joint_names))
-        if not isinstance(leaf, PoseOperator | Wrench):
+        moves = {*leaf.links()[1:], *leaf.references()} & {*self._kinematics.links}
+        if not isinstance(leaf, Wrench) and (not isinstance(leaf, PoseOperator) or moves):
             raise DataError(
                 f"{leaf!r} has no rows in torque space: there are those of Canonical, of "
-                "positions and orientations, their stacks, and Wrench"
+                "positions and orientations seen from a place, their stacks, and Wrench"
             )
-        first = self.first_row(leaf)
+        first = self.first_row(leaf.link) + 3 * (getattr(leaf, "gain", None) is not None)
         return [first, first + 1, first + 2]
 
-    def first_row(self, leaf: PoseOperator | Wrench) -> int:
-        """Where the rows of an operator begin; those of one body are six, positions first."""
-        link, *held = leaf.links()
-        places = [name for name in leaf.references() if name in self._kinematics.links]
-        body, turn = (link, next(iter((*held, *places)), None), bool(held)), 0
-        if isinstance(leaf, Wrench):
-            body = link, None, False
-        elif leaf.gain is not None:
-            turn = 3
-        number = self._bodies.setdefault(body, len(self._bodies))
-        return self._kinematics.n_joints + 6 * number + turn
+    def first_row(self, link: str) -> int:
+        """Where the six coordinates of a link begin."""
+        return self._kinematics.n_joints + 6 * self._links.index(link)
 
-    def _tolerance(self, leaf: Operator, gains: TorqueGains) -> float:
-        """Standard deviation of the frame that an operator refers to [m or rad]."""
-        frames = {*leaf.links()[1:], *leaf.references()} - {*self._kinematics.links}
-        if not frames or not isinstance(leaf, PoseOperator):
-            return 0.0
-        return gains.frame_tolerance if leaf.gain is None else gains.frame_turn_tolerance
-
-    def jacobian(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """Jacobians (..., 6 B, n) of links and objects, in the base frame.
-
-        Rows are zero where nobody asks for a position, or a turn.
+    def jacobian(self, state: RobotState) -> Tensor:
+        """Jacobians (..., 6 B, n) of links; zero where nobody asks for a position, or a turn.
 
         Parameters
         ----------
         state : RobotState
-        frames : mapping of str to Frame
         """
-        if not self._poses:
-            return state.jacobians[..., 0, :0, :]
-        jacobian = linearize_poses(self._poses, state, frames).jacobian
-        assert jacobian is not None
-        return jacobian * self._asked
+        places = [state.links.index(link) for link in self._links]
+        return state.jacobians[..., places, :, :].flatten(-3, -2) * self._asked
 
     def mixed(self, time: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Means (..., D), their time derivatives and covariances of the local coordinates.
@@ -343,7 +308,6 @@ class LocalGaussians:
             turns = self._turns(at.displacement, state, frames)
             step, moving, matrix = turns @ step, turns @ moving, turns @ matrix
         spread = matrix @ covariance @ matrix.mT * self._same_expert
-        noise = self._noise if at.noise is None else self._noise + FREE * at.noise
         index = self._index
         stiffness, damping, seen = (
             whole[..., index, :][..., index] * self._coupled
@@ -351,7 +315,7 @@ class LocalGaussians:
         )
         error = moving - mechanics.velocity[..., index, None]
         targets = seen @ (stiffness @ step + damping @ error)
-        covariance = stiffness @ (spread + noise.diag_embed()) @ stiffness.mT
+        covariance = stiffness @ (spread + self._noise) @ stiffness.mT
         return TorqueRows(mechanics.consistent[..., index, :], targets.squeeze(-1), covariance)
 
     def _turns(
@@ -369,13 +333,6 @@ class LocalGaussians:
             inverse = quaternions.inverse_left_jacobian(displacement[..., rows])
             turns[..., rows, rows] = rotation @ inverse.mT
         return turns
-
-
-def _poses(link: str, frame: str | None, held: bool) -> tuple[PoseOperator, PoseOperator]:
-    """Position and orientation of a body, as they move with the joints."""
-    if frame is None:
-        return AbsolutePosition(link), AbsoluteOrientation(link)
-    return RelativePosition(link, frame, held=held), RelativeOrientation(link, frame, held=held)
 
 
 def fastest(rates: Tensor) -> Tensor:
