@@ -539,7 +539,7 @@ class Controller:
         every, poses, lost = torch.ones_like(arrived), self._inputs.poses, self._inputs.lost
         unseen = {n: lost.get(n, every & (n not in poses)) for n in self._frames}
         return Moment(
-            self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
+            self.time, self._skill.kinematics.state(postures), self._frames, unseen,
             self.holding, self.contacts, arrived,
         )  # fmt: skip
 

@@ -39,8 +39,6 @@ class Moment:
         In the skill [s].
     state : RobotState
         Of the joints as they are measured, or as they should be where nothing is.
-    reference : Tensor of shape (..., n_joints)
-        [rad or m].
     frames : mapping of str to Frame
         Where objects are seen, or were seen last.
     unseen : mapping of str to Tensor of bool of shape (...)
@@ -56,7 +54,6 @@ class Moment:
 
     time: Tensor
     state: RobotState
-    reference: Tensor
     frames: Mapping[str, Frame]
     unseen: Mapping[str, Tensor]
     holding: Holding
@@ -226,7 +223,7 @@ class Gates:
     def _gripped(self, moment: Moment) -> Mapping[Hold, Grip]:
         """The links and objects that conditions ask for."""
         grips, no_robot = dict(self.grips), moment.no_robot
-        for hold in (hold for gate in self.gates for hold in gate.watched):
+        for hold in (hold for gate in self.gates for _, hold in gate.holds):
             if hold.frame in moment.frames:
                 link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
                 grip = grips.get(hold) or Grip(link, thing, no_robot, no_robot)
@@ -278,7 +275,7 @@ class Gates:
         """Of each condition, why robots (B,) do not meet it; empty where they do."""
         for one in gate.until:
             if one in ("held", "free"):
-                holds = gate.held if one == "held" else gate.freed
+                holds = (hold for name, hold in gate.holds if name == one)
                 found = [self._holds(hold, moment, one == "free") for hold in holds]
             else:
                 found = [_met(one, moment)]

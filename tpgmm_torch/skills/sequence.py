@@ -203,17 +203,17 @@ class Sequence(CompositeSkill):
     @cached_property
     def gates(self) -> tuple[Gate, ...]:
         """See :attr:`Skill.gates`: ends of skills at which something is waited for."""
-        gates: list[Gate] = []
-        separate = (*self._separate, False)
-        for k, (one, name) in enumerate(zip(self.skills, self.names, strict=True)):
-            by, (times, back) = self._shifts[k], self.retry[k]
-            inner = [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
-            own = Gate(
-                self._stretches[k][1], self.until[k], self.timeout, times,
-                self._stretches[back][0], separate[k] * self.fade,
-                _held(one), _freed(one), name,
-            )  # fmt: skip
-            gates += [*inner, own] if self.until[k] or separate[k] else inner
+        gates, separate = list[Gate](), (*self._separate, False)
+        for k, (one, by, until) in enumerate(
+            zip(self.skills, self._shifts, self.until, strict=True)
+        ):
+            gates += [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
+            times, back = self.retry[k]
+            if until or separate[k]:
+                holds = tuple(pair for pair in _ends(one) if pair[0] in until)
+                times_of = self._stretches[k][1], until, self.timeout, times
+                begin, fade = self._stretches[back][0], separate[k] * self.fade
+                gates.append(Gate(*times_of, begin, fade, holds, self.names[k]))
         return tuple(gates)
 
     @cached_property
@@ -238,11 +238,10 @@ class Sequence(CompositeSkill):
         first = self.skills[0].summary
         if first is None:
             return None
-        frames = [one.summary.frames for one in self.skills[1:] if one.summary is not None]
         later = {
             name: replace(frame, link=None)  # where a link is at the start of that skill
-            for own in reversed(frames)
-            for name, frame in own.items()
+            for one in reversed(self.skills[1:])
+            for name, frame in (one.summary.frames if one.summary else {}).items()
         }
         return replace(first, frames=later | {**first.frames})
 
@@ -276,16 +275,11 @@ def _shares_clock(one: Skill, other: Skill, fade: float) -> bool:
     return abs(other.begin - one.end) <= min(fade, (one.end - one.begin) / 2)
 
 
-def _held(skill: Skill) -> tuple[Hold, ...]:
-    """What a skill holds when it ends."""
-    return tuple(hold for hold in skill.holds if hold.begin < skill.end <= hold.end)
-
-
-def _freed(skill: Skill) -> tuple[Hold, ...]:
-    """What a skill has let go when it ends."""
-    kept = {hold.frame for hold in _held(skill)}
-    last = {hold.frame: hold for hold in skill.holds if hold.frame not in kept}
-    return tuple(last.values())
+def _ends(skill: Skill) -> tuple[tuple[str, Hold], ...]:
+    """What a skill holds when it ends, ``held``, and what it has let go, ``free``."""
+    free = {hold.frame: ("free", hold) for hold in skill.holds}
+    held = [hold for hold in skill.holds if hold.begin < skill.end <= hold.end]
+    return tuple((free | {hold.frame: ("held", hold) for hold in held}).values())
 
 
 def _held_on(holds: list[Hold], new: Hold) -> list[Hold]:
@@ -338,7 +332,7 @@ def _check_condition(one: Any, skill: Skill) -> None:
     known = [*CONDITIONS, *(CONTACT + link for link in skill.kinematics.links)]
     if one not in known:
         raise UnknownNameError("condition", one, "a sequence, which may have a function", known)
-    if not {"held": _held, "free": _freed}.get(one, lambda skill: True)(skill):
+    if one in ("held", "free") and one not in dict(_ends(skill)):
         raise DataError(
             f"until {one!r}: no object is {one} by the end of this skill, of which the holds "
             f"are {[str(hold) for hold in skill.holds]}"

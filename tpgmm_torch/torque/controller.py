@@ -358,11 +358,13 @@ class TorqueController(Controller):
         time, frames, last, local = command.time, self.holding.frames, self._drive, self._local
         assert local is not None
         pace = torch.where(dt > 0, (time - last.time) / dt, 0.0).clamp(0.0, FASTEST_PACE)
-        rows, forces = [local.rows(time, pace, state, frames, at)], []
+        rows, rates = [local.rows(time, pace, state, frames, at)], [found.rate]
+        forces = list[tuple[ExpectedForce, Tensor]]()
         for one in self._skill.expected_forces(time):
             operator, integral = one.operator, last.integrals.get(one.operator, 0.0)
             axes, first = operator.directions(state, frames), local.first_row(operator.link)
-            rows.append(force_row(one, axes, integral, first, at, self._gains))
+            row, rate = force_row(one, axes, integral, first, at, self._gains)
+            rows, rates = [*rows, row], [*rates, rate]
             forces.append((one, axes))
         fused, covariance = fused_torque(rows, at)
         step = (self._compliance @ fused.unsqueeze(-1)).squeeze(-1)
@@ -371,8 +373,8 @@ class TorqueController(Controller):
             self._compliance @ covariance @ self._compliance,
             local.skill.weights_at(time),
         )
-        rates = torch.stack([found.rate, *(row.rate for row in rows[1:])])
-        return replace(found, fused=fused, rate=rates.amax(0), estimate=estimate, forces=forces)
+        rate = torch.stack(rates).amax(0)
+        return replace(found, fused=fused, rate=rate, estimate=estimate, forces=forces)
 
     def _integrated(self, found: Found, passed: Tensor, dt: Tensor) -> dict[Wrench, Tensor]:
         """Integrals of the errors of forces in contact, at most as large as the forces.

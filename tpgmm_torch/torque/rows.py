@@ -17,11 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
@@ -47,6 +45,9 @@ PRIOR = 1e-9
 LEAST_SHARE = 1e-3
 #: Inverse of the largest mass and inertia of a link that count [1/kg, 1/(kg m^2)].
 LEAST_MOBILITY = 1e-3
+
+#: ``T`` (..., m, n), ``y`` (..., m, 1) [N m or N] and the covariance of rows ``T tau' = y``.
+TorqueRows = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,21 +102,24 @@ class Mechanics:
         stiffness : Tensor of shape (..., N, N), optional
             Of joints and links, by default that of the gains for this state.
         """
+
+        def blocks(joints: Tensor, links: Tensor) -> Tensor:
+            return gaussians.block_diagonal((joints, links), inertia.shape[:-2])
+
         inverse = torch.cholesky_inverse(gaussians.cholesky(inertia, "the inertia"))
         accelerations = jacobian @ inverse
         link = torch.arange(jacobian.shape[-2], device=jacobian.device) // 6
-        mobility = accelerations @ jacobian.mT * (link[:, None] == link)
-        masses, seen = _inverse(mobility)
+        own = accelerations @ jacobian.mT * (link[:, None] == link)
+        masses, seen = _inverse(own)
         if stiffness is None:
-            stiffness = _blocks(*gains.stiffness(inertia, mobility))
-        eye = torch.eye(inertia.shape[-1]).to(inertia).expand_as(inertia)
-        damping = geometric_mean(stiffness, _blocks(inertia, masses))
-        damping = 2 * gains.damping_ratio * damping
-        mobility = _blocks(inverse, mobility)
+            stiffness = blocks(*gains.stiffness(inertia, own))
+        damping = 2 * gains.damping_ratio * geometric_mean(stiffness, blocks(inertia, masses))
+        eye = torch.eye(inertia.shape[-1]).to(inertia)
+        mobility = blocks(inverse, own)
         return cls(
             mobility,
-            torch.cat((eye, masses @ accelerations), -2),
-            _blocks(eye, seen),
+            torch.cat((eye.expand_as(inertia), masses @ accelerations), -2),
+            blocks(eye, seen),
             torch.cat((velocities, (jacobian @ velocities.unsqueeze(-1)).squeeze(-1)), -1),
             stiffness,
             damping,
@@ -143,33 +147,6 @@ def _inverse(mobility: Tensor) -> tuple[Tensor, Tensor]:
     left = scale.unsqueeze(-1) * vectors
     masses = left * (kept / torch.where(values > 0, values, 1.0)).unsqueeze(-2) @ left.mT
     return masses, left * kept.unsqueeze(-2) @ (vectors / scale.unsqueeze(-1)).mT
-
-
-def _blocks(first: Tensor, second: Tensor) -> Tensor:
-    """Two matrices on the diagonal of one."""
-    n, m = first.shape[-1], second.shape[-1]
-    return pad(first, (0, m, 0, m)) + pad(second, (n, 0, n, 0))
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueRows:
-    """Rows ``T tau' = y``.
-
-    Parameters
-    ----------
-    consistent : Tensor of shape (..., m, n)
-        ``T``.
-    targets : Tensor of shape (..., m)
-        ``y`` [N m or N].
-    covariance : Tensor of shape (..., m, m)
-    rate : Tensor of shape (...), optional
-        Of a damping of its own, beside that of the mechanics [1/s].
-    """
-
-    consistent: Tensor
-    targets: Tensor
-    covariance: Tensor
-    rate: Any = 0.0
 
 
 class LocalGaussians:
@@ -316,7 +293,7 @@ class LocalGaussians:
         error = moving - mechanics.velocity[..., index, None]
         targets = seen @ (stiffness @ step + damping @ error)
         covariance = stiffness @ (spread + self._noise) @ stiffness.mT
-        return TorqueRows(mechanics.consistent[..., index, :], targets.squeeze(-1), covariance)
+        return mechanics.consistent[..., index, :], targets, covariance
 
     def _turns(
         self, displacement: Tensor, state: RobotState, frames: Mapping[str, Frame]
@@ -353,7 +330,7 @@ def force_row(
     first: int,
     mechanics: Mechanics,
     gains: TorqueGains,
-) -> TorqueRows:
+) -> tuple[TorqueRows, Tensor]:
     r"""Rows of an expected force along axes ``e``: ``e^T T tau' = f - D_f e^T v + integral``.
 
     Where only a share :math:`\kappa` of the demonstrations is in contact, the variance grows
@@ -372,6 +349,12 @@ def force_row(
         Where the coordinates of the link begin.
     mechanics : Mechanics
     gains : TorqueGains
+
+    Returns
+    -------
+    rows : TorqueRows
+    rate : Tensor of shape (...)
+        Of their own damping [1/s].
     """
     rows, share = slice(first, first + 3), one.share.clamp_min(LEAST_SHARE)[..., None]
     mobility = axes @ mechanics.mobility[..., rows, rows] @ axes.mT
@@ -381,12 +364,10 @@ def force_row(
     targets = (one.force + integral - damping * speed).unsqueeze(-1)
     force = one.force.square().sum(-1, keepdim=True) / share.square()
     noise = (force + one.operator.contact**2) * (1 - share) / share
-    return TorqueRows(
-        axes @ mechanics.consistent[..., rows, :],
-        (axes @ mechanics.seen[..., rows, rows] @ axes.mT @ targets).squeeze(-1),
-        one.covariance + noise.expand_as(one.force).diag_embed(),
-        (damping / masses).amax(-1),
-    )
+    targets = axes @ mechanics.seen[..., rows, rows] @ axes.mT @ targets
+    covariance = one.covariance + noise.expand_as(one.force).diag_embed()
+    consistent = axes @ mechanics.consistent[..., rows, :]
+    return (consistent, targets, covariance), (damping / masses).amax(-1)
 
 
 def fused_torque(rows: Sequence[TorqueRows], mechanics: Mechanics) -> tuple[Tensor, Tensor]:
@@ -403,9 +384,7 @@ def fused_torque(rows: Sequence[TorqueRows], mechanics: Mechanics) -> tuple[Tens
     precision = PRIOR * mechanics.mobility[..., :n, :n]
     vector = precision @ mechanics.held.unsqueeze(-1)
     for one in rows:
-        more, towards, _ = gaussians.information(
-            one.consistent, one.targets.unsqueeze(-1), one.covariance
-        )
+        more, towards, _ = gaussians.information(*one)
         precision, vector = precision + more, vector + towards
     torque, covariance = gaussians.from_information(precision, vector.squeeze(-1))
     return torque, covariance

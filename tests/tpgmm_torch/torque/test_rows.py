@@ -55,7 +55,7 @@ def torque(model, q, gains=TorqueGains(), stiffness=None):  # noqa: B008
     rows = [local.rows(time, time + 1, state, FRAMES, mechanics)]
     for one in model.expected_forces(time):
         axes, first = one.operator.directions(state, FRAMES), local.first_row(one.operator.link)
-        rows.append(force_row(one, axes, 0.0, first, mechanics, gains))
+        rows.append(force_row(one, axes, 0.0, first, mechanics, gains)[0])
     return fused_torque(rows, mechanics)[0].numpy(), mechanics
 
 
