@@ -259,10 +259,6 @@ class Sequence(CompositeSkill):
         one = passed.new_ones(*passed.shape[:-1], 1)
         return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
 
-    def skill_at(self, time: float) -> Skill:
-        """The skill that has the largest share at a time [s]."""
-        return self.skills[int(self.shares(self.time.new_tensor(time)).argmax())]
-
     def observed(self, names: frozenset[str]) -> Skill | None:
         """See :meth:`Skill.observed`."""
         several = [one.observed(names) for one in self.skills]

@@ -174,7 +174,7 @@ class TorqueController(Controller):
             raise DataError("trust=None follows every reading: torques need trust=Trust(...)")
         self._dynamics, self._gains = dynamics, gains
         start, zero = self.reference, torch.zeros_like(self.reference)
-        self._local, self._tick, n = None, None, start.shape[-1]
+        self._local, self._tick, self._stiffness, n = None, None, None, start.shape[-1]
         if self._skill.expected_forces(self.time):
             if not isinstance(self._skill, Regression):
                 raise DataError(
@@ -324,13 +324,12 @@ class TorqueController(Controller):
         jacobian = inertia[..., :0, :]
         if self._local is not None:
             jacobian = self._local.jacobian(state)
-        stiffness = getattr(self, "_stiffness", None)
-        return Mechanics.at(inertia, jacobian, velocities, self._gains, stiffness)
+        return Mechanics.at(inertia, jacobian, velocities, self._gains, self._stiffness)
 
     def _torques(
         self, command: Command, joints: Tensor, velocities: Tensor, dt: Tensor
     ) -> Found:
-        """Torques at a state; not a number where there are none."""
+        """Torques at a state; NaN where nothing gives one."""
         inertia, bias = self._dynamics(joints, velocities)
         try:
             state = self._state(joints)

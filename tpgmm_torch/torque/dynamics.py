@@ -79,14 +79,10 @@ class MujocoDynamics:
         for name in names:
             if name not in known:
                 raise UnknownNameError("joint", name, "the model of the dynamics", known)
-        self._map(robot, known)
         efforts = _efforts(model)[[known.index(name) for name in names]]
         self.effort = torch.from_numpy(efforts).to(robot.lower)
-
-    def _map(self, robot: Robot, known: list[str]) -> None:
-        """Joints of the model as functions of the joint vector."""
-        model, names = self._model, robot.joint_names
-        # what the robot does not know, as objects, stays where it begins
+        # joints of the model are functions of the joint vector; what the robot does not know,
+        # as objects, stays where it begins
         moved = [name for name in known if name in robot.model.movable]
         index, locked = [known.index(name) for name in moved], robot.config()["locked"]
         self._places, rows = model.jnt_qposadr[index], model.jnt_dofadr[index]

@@ -37,7 +37,6 @@ def test_shares_are_weights_that_pass_from_one_to_the_next():
     assert shares[0].tolist() == [1, 0] and shares[-1].tolist() == [0, 1]
     mixed = ((shares > 0) & (shares < 1)).all(-1).sum()
     assert 15 <= int(mixed) <= 21  # 0.2 s
-    assert skill.skill_at(0.2) is skill.skills[0] and skill.skill_at(1.8) is skill.skills[1]
 
 
 def test_each_part_has_operators_of_its_own():
