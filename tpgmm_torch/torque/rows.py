@@ -158,7 +158,7 @@ class LocalGaussians:
     Parameters
     ----------
     skill : Regression
-        With operators of joints, of positions and orientations of links as places or the base
+        With operators of joints, of positions and quaternions of links as places or the base
         see them, their stacks, and of forces.
     gains : TorqueGains
 
@@ -174,7 +174,6 @@ class LocalGaussians:
             self._conditionals = Conditionals.stacked(skill.fused)
         self._stack = Stack(*of_joints(skill.operators))
         self._starts = self._stack.quaternion_starts(skill.kinematics)
-        self._tangents: list[tuple[int, PoseOperator]] = []
         noise, links = list[float](), dict[str, None]()
         labels = list[tuple[int, ...]]()  # operator, leaf, block and coordinate
         for leaf in leaves(skill.operators):
@@ -186,8 +185,6 @@ class LocalGaussians:
                 asked.update(rows)
                 if isinstance(leaf, Wrench):
                     continue
-                if leaf.rotation_vector_starts(skill.kinematics):
-                    self._tangents.append((at, leaf))  # type: ignore[arg-type]
                 block = 0 if isinstance(leaf, Canonical) else rows[0]
                 labels += [(expert, at, block, row) for row in rows]
                 turns = getattr(leaf, "gain", None) is not None
@@ -207,10 +204,11 @@ class LocalGaussians:
         if isinstance(leaf, Canonical):
             return list(leaf.columns(self._kinematics.joint_names))
         moves = {*leaf.links()[1:], *leaf.references()} & {*self._kinematics.links}
-        if not isinstance(leaf, Wrench) and (not isinstance(leaf, PoseOperator) or moves):
+        other = moves or leaf.rotation_vector_starts(self._kinematics)
+        if not isinstance(leaf, Wrench) and (not isinstance(leaf, PoseOperator) or other):
             raise DataError(
                 f"{leaf!r} has no rows in torque space: there are those of Canonical, of "
-                "positions and orientations seen from a place, their stacks, and Wrench"
+                "positions and quaternions seen from a place, their stacks, and Wrench"
             )
         first = self.first_row(leaf.link) + 3 * (getattr(leaf, "gain", None) is not None)
         return [first, first + 1, first + 2]
@@ -272,18 +270,14 @@ class LocalGaussians:
         mechanics : Mechanics
             Of :meth:`jacobian`.
         """
-        stack = self._stack.at(time)
-        at = stack.linearize(state, frames)
+        at = self._stack.linearize(state, frames)
         present = at.present
         if present is None:
-            present = stack.coordinates(state, frames) if self._starts else state.joints
+            present = self._stack.coordinates(state, frames) if self._starts else state.joints
         mean, speed, covariance = self.mixed(time, present)
         _, matrix = at.dense()
         step = matrix @ mean.unsqueeze(-1) + at.displacement.unsqueeze(-1)
         moving = pace[..., None, None] * (matrix @ speed.unsqueeze(-1))
-        if self._tangents:
-            turns = self._turns(at.displacement, state, frames)
-            step, moving, matrix = turns @ step, turns @ moving, turns @ matrix
         spread = matrix @ covariance @ matrix.mT * self._same_expert
         index = self._index
         stiffness, damping, seen = (
@@ -294,22 +288,6 @@ class LocalGaussians:
         targets = seen @ (stiffness @ step + damping @ error)
         covariance = stiffness @ (spread + self._noise) @ stiffness.mT
         return mechanics.consistent[..., index, :], targets, covariance
-
-    def _turns(
-        self, displacement: Tensor, state: RobotState, frames: Mapping[str, Frame]
-    ) -> Tensor:
-        """From tangent spaces to the base frame (..., m, m), by the transposed factor of ``J``.
-
-        ``J = J_r(y)^-1 R(eps)^T J_o``: the torque of the potential ``k |mu - y|^2 / 2`` is
-        ``J_o^T R(eps) J_r(y)^-T k (mu - y)``, however large the turn.
-        """
-        turns = torch.ones_like(displacement).diag_embed()
-        for at, leaf in self._tangents:
-            rows = slice(at, at + 3)
-            rotation = quaternions.to_matrix(leaf.poses(state, frames)[0].orientation)
-            inverse = quaternions.inverse_left_jacobian(displacement[..., rows])
-            turns[..., rows, rows] = rotation @ inverse.mT
-        return turns
 
 
 def fastest(rates: Tensor) -> Tensor:
