@@ -55,7 +55,7 @@ def parse_operator(text: str) -> Operator:
     Raises
     ------
     DataError
-        If a term has no such form; the message says what one looks like.
+        If a term is none of these; the message says what one looks like.
 
     Examples
     --------

@@ -51,7 +51,7 @@ class Wrench(Operator):
     Raises
     ------
     DataError
-        If axes are not 0, 1 or 2, or ``contact`` is not above 0.
+        If axes are none of 0, 1, 2, or ``contact`` is not above 0.
 
     Examples
     --------

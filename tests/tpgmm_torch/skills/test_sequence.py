@@ -152,5 +152,5 @@ def test_a_line_of_text_is_a_sequence():
 def test_what_makes_no_sequence_is_refused(options, message):
     with pytest.raises(DataError, match=message):
         Sequence((of("pick"), of("home")), **options)
-    with pytest.raises(UnknownNameError, match="condition 3 .* a function"):
+    with pytest.raises(UnknownNameError, match=r"condition 3 .* a function"):
         Sequence((of("pick"), of("home")), until=3)
