@@ -7,6 +7,7 @@ leave directions of ``x`` free, where eq. (2) would invert a singular matrix.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
+    "block_diagonal",
     "cholesky",
     "common_shape",
     "condition",
@@ -37,6 +39,24 @@ def common_shape(*shapes: torch.Size) -> torch.Size:
     if len(set(shapes)) == 1:
         return shapes[0]
     return torch.Size(np.broadcast_shapes(*shapes))
+
+
+def block_diagonal(matrices: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
+    """One matrix with others on its diagonal, zero elsewhere.
+
+    Parameters
+    ----------
+    matrices : sequence of Tensor of shape (..., m, n)
+    batch : sequence of int
+        Shape of the batch, with which theirs broadcast.
+    """
+    sizes = [matrix.shape[-2:] for matrix in matrices]
+    whole = matrices[0].new_zeros(*batch, *map(sum, zip(*sizes, strict=True)))
+    row = column = 0
+    for matrix, (rows, columns) in zip(matrices, sizes, strict=True):
+        whole[..., row : row + rows, column : column + columns] = matrix
+        row, column = row + rows, column + columns
+    return whole
 
 
 def cholesky(matrix: Tensor, name: str) -> Tensor:

@@ -12,7 +12,6 @@ operators of this link then agree on moving it by ``d e``, and others do not cha
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -20,8 +19,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.wrenches import Wrenches
@@ -58,9 +57,7 @@ class Admittance:
     release: float = 0.5
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < math.inf:
-                raise DataError(f"{name} of an Admittance is above 0 and finite, got {value!r}")
+        check_positive(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +78,7 @@ class Offsets:
         self,
         expected: Sequence[ExpectedForce],
         wrenches: Wrenches,
-        state: RobotState | None,
+        state: RobotState,
         frames: Mapping[str, Frame],
         dt: Tensor,
     ) -> Self:
@@ -93,37 +90,34 @@ class Offsets:
             Of this tick. Operators that are no longer among them are given up.
         wrenches : Wrenches
             Robots without a fresh one keep their offsets.
-        state : RobotState or None
-            Of the robots, without offsets, where axes are those of links.
+        state : RobotState
+            Of the robots, without offsets.
         frames : mapping of str to Frame
         dt : Tensor of shape (...)
             Since the last tick [s]; 0 for robots that are held.
         """
-        asked = {one.operator: one for one in expected}
-        values = {}
+        asked, values, limits = {one.operator: one for one in expected}, {}, self.settings
         for operator in dict.fromkeys((*self.values, *asked)):
             reading = wrenches.readings.get(operator.link)
             if reading is None:
                 continue
-            force = torch.from_numpy(reading.value[..., :3]).to(dt)
-            felt = operator.components(force, state, frames)
-            touches = torch.from_numpy(reading.touches).to(dt.device).unsqueeze(-1)
-            felt = torch.where(touches, felt, 0.0)
-            wanted, share = torch.zeros_like(felt), torch.zeros_like(felt[..., :1])
+            force, touches, fresh = (
+                torch.from_numpy(array).to(dt.device)
+                for array in (reading.value[..., :3], reading.touches, reading.fresh)
+            )
+            felt = operator.components(force.to(dt), state, frames)
+            error, share = -torch.where(touches.unsqueeze(-1), felt, 0.0), 0 * felt[..., :1]
             if operator in asked:
-                wanted, share = asked[operator].force, asked[operator].share.unsqueeze(-1)
-            fresh = torch.from_numpy(reading.fresh).to(dt.device)
+                error = error + asked[operator].force
+                share = asked[operator].share.unsqueeze(-1)
             passed = torch.where(fresh, dt, 0.0).unsqueeze(-1)
             before = self.values.get(operator, torch.zeros_like(felt))
-            values[operator] = self._moved(before, wanted - felt, share, passed)
+            # exact for the release, within speed and depth
+            rate = (error / limits.damping).clamp(-limits.speed, limits.speed)
+            left = torch.exp(-(1 - share) * passed / limits.release)
+            moved = before * left + rate * passed
+            values[operator] = moved.clamp(-limits.depth, limits.depth)
         return replace(self, values=values)
-
-    def _moved(self, offset: Tensor, error: Tensor, share: Tensor, dt: Tensor) -> Tensor:
-        """Offsets after ``dt``: exact for the release, within speed and depth."""
-        limits = self.settings
-        rate = (error / limits.damping).clamp(-limits.speed, limits.speed)
-        left = torch.exp(-(1 - share) * dt / limits.release)
-        return (offset * left + rate * dt).clamp(-limits.depth, limits.depth)
 
     @property
     def active(self) -> bool:
@@ -139,10 +133,7 @@ class Offsets:
             Of the robots alone.
         frames : mapping of str to Frame
         """
-        steps = [
-            (operator.link, operator.along_axes(-value, state, frames))
-            for operator, value in self.values.items()
-        ]
-        for link, step in steps:
-            state = state.displaced(link, step)
+        for operator, value in self.values.items():
+            axes = operator.directions(state, frames)
+            state = state.displaced(operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2))
         return state

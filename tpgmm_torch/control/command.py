@@ -78,6 +78,9 @@ class Command:
     offset : Tensor of shape (..., n_joints), optional
         What readings exceed positions by, as it is estimated: sag, payload, an encoder that
         slipped [rad or m].
+    torque : Tensor of shape (..., n_joints), optional
+        Of each joint, gravity and the bias of the motion included, from a
+        :class:`~tpgmm_torch.torque.TorqueController` [N m or N].
     """
 
     reference: Tensor
@@ -90,6 +93,7 @@ class Command:
     compute_novelty: Callable[[], Tensor] | None = None
     relocalized: Tensor | None = None
     offset: Tensor | None = None
+    torque: Tensor | None = None
 
     def __repr__(self) -> str:
         return (
@@ -245,7 +249,11 @@ def statuses(
     obstructed : mapping of int to (bool, str)
         Robots that obstacles keep off: whether time waits for them, and why.
     """
-    codes, texts = _at_gates(progress, gates)
+    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    if gates is not None and gates.reasons:
+        texts |= gates.reasons
+        codes[list(texts)] = Status.WAITING.code
+        codes[gates.failed] = Status.HOLDING.code
     if progress.waits.any():
         texts |= _waiting(progress, names, wanted, inputs)
         codes[progress.waits] = Status.WAITING.code
@@ -264,18 +272,6 @@ def statuses(
         codes[halted] = Status.HOLDING.code
         reasons |= inputs.reasons(halted.reshape(tuple(batch)))
     return codes, reasons or _NO_REASONS
-
-
-def _at_gates(
-    progress: Progress, gates: Gates | None
-) -> tuple[NDArray[np.int8], dict[int, str]]:
-    """The status of robots that stand at the end of a skill of a sequence, and why."""
-    codes = np.zeros(len(progress.time), np.int8)
-    if gates is None or not gates.reasons:
-        return codes, {}
-    codes[list(gates.reasons)] = Status.WAITING.code
-    codes[gates.failed] = Status.HOLDING.code
-    return codes, dict(gates.reasons)
 
 
 def _waiting(

@@ -225,7 +225,10 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
-        self._wrenches, forces = _expected_contacts(skill, start, begin)
+        forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+        contacts = {operator.link: operator.contact for operator in forces}
+        self._wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), contacts)
+        self._needs_wrench = admittance is not None and bool(forces)
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
@@ -352,10 +355,7 @@ class Controller:
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
             self._touch(tick)
-            self._follow(tick, *self._reach(tick, self._estimate(tick)))
-        else:
-            assert self.command is not None
-            self._follow(tick, self.command.estimate, self._following.wanted, None)
+        self._move(tick)
         return self._send(tick)
 
     def copy(self) -> Self:
@@ -424,13 +424,12 @@ class Controller:
 
     def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
         """Measured wrenches; ages of inputs, with those that are missing too long."""
-        if tick.first and self._trusts and self._offsets is not None and not wrenches:
+        if tick.first and self._trusts and self._needs_wrench and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
         self._wrenches = self._wrenches.update(tick.seconds, wrenches)
         if self._inputs is None:
             return ages
-        late = self._wrenches.late(self._inputs.trust.joint_timeout)
-        return {**ages, **late} if isinstance(ages, Mapping) and late else late or ages
+        return {**(ages or {}), **self._wrenches.late(self._inputs.trust.joint_timeout)}
 
     def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
@@ -459,8 +458,7 @@ class Controller:
         before = self._progress
         none: Flags = np.zeros(len(before.time), bool)
         passed = none + np.ravel(tick.seconds)
-        held = [robots for robots in (tick.halted, tick.late) if robots is not None]
-        still: Flags = np.logical_or.reduce([none, *held])
+        still = self._stands(tick)
         tick.obstructed = self._obstruction(passed)
         if not self._trusts and tick.joints is None:
             self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
@@ -510,9 +508,7 @@ class Controller:
             return
         progress, postures = self._progress, self._postures(tick, measured=True)
         passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
-        ready = progress.mode == RUNNING
-        for robots in (tick.halted, tick.late):
-            ready = ready if robots is None else ready & ~robots
+        ready = (progress.mode == RUNNING) & ~self._stands(tick)
         moment = None
         if self._inputs is not None and np.isfinite(self._gates.stop).any():
             moment = self._moment(tick, postures)
@@ -526,18 +522,24 @@ class Controller:
             self._holds = self._holds.released(back, postures, self._frames)
             self._resume(gates.returned)
 
+    def _stands(self, tick: _Tick) -> Flags:
+        """Robots (B,) without accepted inputs, or whose time did not increase."""
+        none: Flags = np.zeros(len(self._progress.time), bool)
+        return np.logical_or.reduce(
+            [none, *(x for x in (tick.halted, tick.late) if x is not None)]
+        )
+
     def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
         """What the conditions of gates are asked of."""
         reference, velocity = self.reference.detach(), self._following.velocity.detach()
         readings = torch.nan * reference if tick.joints is None else tick.joints
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
         arrived = self._tensor(self._progress.arrived(*arrays))
-        none = torch.zeros_like(reference[..., 0], dtype=torch.bool)
         assert self._inputs is not None
-        unseen = {n: ~none for n in self._frames.keys() - self._inputs.poses.keys()}
-        unseen |= self._inputs.lost
+        every, poses, lost = torch.ones_like(arrived), self._inputs.poses, self._inputs.lost
+        unseen = {n: lost.get(n, every & (n not in poses)) for n in self._frames}
         return Moment(
-            self.time, self._skill.kinematics.state(postures), reference, self._frames, unseen,
+            self.time, self._skill.kinematics.state(postures), self._frames, unseen,
             self.holding, self.contacts, arrived,
         )  # fmt: skip
 
@@ -551,18 +553,13 @@ class Controller:
         """How far links are moved by the errors of their forces."""
         if self._offsets is None or not self._wrenches.readings:
             return
-        expected, kinematics = self._skill.expected_forces(tick.time), self._skill.kinematics
-        operators, state = (*(one.operator for one in expected), *self._offsets.values), None
-        if any(operator.frame in kinematics.links for operator in operators):
-            state = kinematics.state(self._postures(tick, measured=True))
+        state = self._skill.kinematics.state(self._postures(tick, measured=True))
         passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
-        passed = passed.expand(self.reference.shape[:-1])
-        for robots in (tick.halted, tick.late):
-            if robots is not None:
-                passed = torch.where(self._tensor(robots), 0.0, passed)
+        passed = torch.where(self._tensor(self._stands(tick)), 0.0, passed)
         self._offsets = self._offsets.advance(
-            expected, self._wrenches, state, self.holding.frames, passed
-        )
+            self._skill.expected_forces(tick.time), self._wrenches, state, self.holding.frames,
+            passed,
+        )  # fmt: skip
 
     def _estimate(self, tick: _Tick) -> Estimate:
         """What the skill says."""
@@ -607,6 +604,14 @@ class Controller:
             not self._trusts,
         )  # fmt: skip
         return self._rounded(joints, shift), None
+
+    def _move(self, tick: _Tick) -> None:
+        """From the estimate to the next references."""
+        if tick.ended is None or not bool(tick.ended.all()):
+            self._follow(tick, *self._reach(tick, self._estimate(tick)))
+        else:
+            assert self.command is not None
+            self._follow(tick, self.command.estimate, self._following.wanted, None)
 
     def _follow(
         self, tick: _Tick, found: Estimate, wanted: Tensor, fitting: Follower | None
@@ -733,11 +738,10 @@ LONG_TICK = (
     "dt is more than a second: it is in seconds, not in milliseconds; after a pause of the "
     "loop, the skill goes on as if half a second had passed"
 )
-
-
 NO_WRENCH = (
-    "the skill expects forces, and the first step has no wrench: references follow positions "
-    "alone. Give step(..., wrenches={link: ...}), or Controller(..., admittance=None)"
+    "the skill expects forces, and the first step has no wrench: what is measured corrects "
+    "nothing. Give step(..., wrenches={link: ...}), or do without, Controller(..., "
+    "admittance=None), TorqueGains(integral=0)"
 )
 
 
@@ -762,14 +766,6 @@ def _rows(array: Array) -> Array:
 
 def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
-
-
-def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> tuple[Wrenches, bool]:
-    """Readings of wrenches before the first, and whether the skill expects forces."""
-    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
-    thresholds = {operator.link: operator.contact for operator in forces}
-    wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), thresholds)
-    return wrenches, bool(forces)
 
 
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import repeat
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -38,13 +39,11 @@ class Moment:
         In the skill [s].
     state : RobotState
         Of the joints as they are measured, or as they should be where nothing is.
-    reference : Tensor of shape (..., n_joints)
-        [rad or m].
     frames : mapping of str to Frame
         Where objects are seen, or were seen last.
     unseen : mapping of str to Tensor of bool of shape (...)
-        Which robots do not see an object now; objects that were given at the start alone are
-        seen by none.
+        Which robots do not see an object of :attr:`frames` now; those that were given at the
+        start alone are seen by none.
     holding : Holding
         What the robots hold.
     contacts : mapping of str to Tensor of bool of shape (...)
@@ -55,7 +54,6 @@ class Moment:
 
     time: Tensor
     state: RobotState
-    reference: Tensor
     frames: Mapping[str, Frame]
     unseen: Mapping[str, Tensor]
     holding: Holding
@@ -66,10 +64,6 @@ class Moment:
     def no_robot(self) -> Tensor:
         """False (...)."""
         return self.arrived & False
-
-    def hidden(self, name: str) -> Tensor:
-        """Robots (...) that do not see an object now."""
-        return self.no_robot | self.unseen.get(name, self.no_robot)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +88,10 @@ class Grip:
     def update(self, hold: Hold, moment: Moment) -> Self:
         """After a tick."""
         link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
-        index, held = moment.holding.kinematics.links.index(hold.link), moment.holding.held
         holds = moment.no_robot
-        if hold.frame in held:
-            holds = holds | (held[hold.frame].carrier.to(holds.device) == index)
+        if (held := moment.holding.held.get(hold.frame)) is not None:
+            index = moment.holding.kinematics.links.index(hold.link)
+            holds = holds | (held.carrier.to(holds.device) == index)
         new = holds & ~self.holds
         grip = replace(
             self, link=choose(new, link, self.link), thing=choose(new, thing, self.thing)
@@ -105,7 +99,7 @@ class Grip:
         there = grip.carried(hold, moment)
         off, way = (one.change(there, LOST, LOST_TURN) for one in (thing, grip.thing))
         along = (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
-        known = torch.where(moment.hidden(hold.frame), self.carries & ~new, along)
+        known = torch.where(moment.unseen[hold.frame], self.carries & ~new, along)
         return replace(grip, holds=holds, carries=holds & known)
 
     def kept(self, robots: Tensor) -> Self:
@@ -204,16 +198,15 @@ class Gates:
                 new = new._opened(rows, np.maximum(time, gate.onward))
         stands = time >= new.stop
         at = stands & ready & ~self.failed
-        waited = np.where(at, new.waited + dt, stands * new.waited)
+        new = replace(new, waited=np.where(at, new.waited + dt, stands * new.waited))
         if moment is None:
-            met_for = np.where(at & (new.met_for > 0), new.met_for + dt, new.met_for)
-            return replace(new, waited=waited, met_for=met_for)
-        new = replace(
-            new, grips=new._gripped(moment), waited=waited, met_for=stands * new.met_for
-        )
+            return replace(new, met_for=new.met_for + (at & (new.met_for > 0)) * dt)
         waits = (stands & ~at) | self.failed
         kept = {row: text for row, text in self.reasons.items() if waits[row]}
-        return new._decided(at, dt, moment, kept) if at.any() else replace(new, reasons=kept)
+        new = replace(
+            new, grips=new._gripped(moment), met_for=stands * new.met_for, reasons=kept
+        )
+        return new._decided(at, dt, moment) if at.any() else new
 
     def _opened(self, rows: Flags, time: Any) -> Self:
         """Some robots have passed the next gate, and go on from a time."""
@@ -229,16 +222,15 @@ class Gates:
 
     def _gripped(self, moment: Moment) -> Mapping[Hold, Grip]:
         """The links and objects that conditions ask for."""
-        grips = dict(self.grips)
-        for hold in (hold for gate in self.gates for hold in gate.watched):
+        grips, no_robot = dict(self.grips), moment.no_robot
+        for hold in (hold for gate in self.gates for _, hold in gate.holds):
             if hold.frame in moment.frames:
-                if hold not in grips:
-                    link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
-                    grips[hold] = Grip(link, thing, moment.no_robot, moment.no_robot)
-                grips[hold] = grips[hold].update(hold, moment)
+                link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
+                grip = grips.get(hold) or Grip(link, thing, no_robot, no_robot)
+                grips[hold] = grip.update(hold, moment)
         return grips
 
-    def _decided(self, at: Flags, dt: Array, moment: Moment, reasons: dict[int, str]) -> Self:
+    def _decided(self, at: Flags, dt: Array, moment: Moment) -> Self:
         """Robots at their gates wait, go on, go back, or give up."""
         why = self._asked(at, moment)
         number = np.minimum(self.index, len(self.gates) - 1)
@@ -248,9 +240,10 @@ class Gates:
         met_for = np.where(at, met * (self.met_for + dt), self.met_for)
         late = at & ~met & (self.waited >= timeout)
         tries = self.tries + late[:, None] * np.eye(len(self.gates), dtype=int)[number]
-        count = np.take_along_axis(tries, number[:, None], 1)[:, 0]
+        count = tries[np.arange(len(at)), number]
         fails, goes, opens = late & (count > retries), late & (count <= retries), met
         opens = opens & (met_for >= LOST_TIME)
+        reasons = dict(self.reasons)
         for row in np.flatnonzero(at & ~goes & ~opens).tolist():
             after = f" after {count[row]} tries" if fails[row] and count[row] > 1 else ""
             text = f"met for {met_for[row]:.1f} s of {LOST_TIME:g} s"
@@ -273,67 +266,57 @@ class Gates:
         """Why robots (B,) at their gates may not go on; empty where they may."""
         why = [""] * len(at)
         for number in np.unique(self.index[at]).tolist():
-            gate = self.gates[number]
-            every = [self._unmet(each, gate, moment) for each in gate.until]
+            unmet = list(self._unmet(self.gates[number], moment))
             for row in np.flatnonzero(at & (self.index == number)).tolist():
-                why[row] = next(filter(None, (texts[row] for texts in every)), "")
+                why[row] = next(filter(None, (texts[row] for texts in unmet)), "")
         return why
 
-    def _unmet(self, condition: Condition, gate: Gate, moment: Moment) -> list[str]:
-        """Why a condition is not met by each robot (B,), in words; empty where it is."""
-        if not isinstance(condition, str):
-            name, met, why = (
-                getattr(condition, "__name__", "a function"),
-                *_called(condition, moment),
-            )
-        elif condition in ("held", "free"):
-            return self._not_all_held(condition, gate, moment)
-        elif condition == "arrived":
-            name, met = condition, moment.arrived
-            why = "joints move, or are not at their reference"
-        else:
-            name, link = condition, condition.removeprefix(CONTACT)
-            met = moment.contacts.get(link, moment.no_robot).expand(moment.arrived.shape)
-            known = link in moment.contacts
-            why = f"{link} touches nothing" if known else "no contact is measured there"
-        return ["" if one else f"{name!r} not met: {why}" for one in _rows(met)]
+    def _unmet(self, gate: Gate, moment: Moment) -> Iterator[list[str]]:
+        """Of each condition, why robots (B,) do not meet it; empty where they do."""
+        for one in gate.until:
+            if one in ("held", "free"):
+                holds = (hold for name, hold in gate.holds if name == one)
+                found = [self._holds(hold, moment, one == "free") for hold in holds]
+            else:
+                found = [_met(one, moment)]
+            name = one if isinstance(one, str) else getattr(one, "__name__", "a function")
+            for met, whys in found:
+                rows = zip(_rows(met), whys, strict=False)
+                yield ["" if ok else f"{name!r} not met: {why}" for ok, why in rows]
 
-    def _not_all_held(self, condition: str, gate: Gate, moment: Moment) -> list[str]:
-        """Of the objects that are to be held, or free, why the first is not."""
-        free = condition == "free"
-        each = [self._not_held(h, moment, free) for h in (gate.freed if free else gate.held)]
-        reasons = (next(filter(None, texts), "") for texts in zip(*each, strict=True))
-        return [why and f"{condition!r} not met: {why}" for why in reasons]
-
-    def _not_held(self, hold: Hold, moment: Moment, free: bool) -> list[str]:
-        """Why an object is not held, or not free, by each robot (B,)."""
+    def _holds(self, hold: Hold, moment: Moment, free: bool) -> tuple[Tensor, Iterable[str]]:
+        """Which robots (...) hold an object, or have let it go, and why others do not."""
         name, grip = hold.frame, self.grips.get(hold)
         if grip is None:
-            return [f"{name} is nowhere"] * moment.arrived.numel()
-        there, seen = grip.carried(hold, moment), moment.frames[name]
-        hidden = moment.hidden(name)
+            return moment.no_robot, repeat(f"{name} is nowhere")
+        there, seen, unseen = grip.carried(hold, moment), moment.frames[name], moment.unseen
         lost = there.change(seen, LOST, LOST_TURN) >= 1
-        met = ~grip.holds & ~hidden & lost if free else grip.carries
-        apart = (there.position - seen.position).norm(dim=-1)
-        table = (each.expand(met.shape) for each in (met, hidden, apart))
-        return [
-            "" if ok
-            else f"{name} is not seen" if gone
-            else f"{name} is {1e3 * away:.0f} mm from where {hold.link} would carry it"
-            for ok, gone, away in zip(*map(_rows, table), strict=True)
-        ]  # fmt: skip
+        apart = 1e3 * (there.position - seen.position).norm(dim=-1)
+        away = (f"{one:.0f} mm from where {hold.link} would carry it" for one in _rows(apart))
+        whys = (
+            f"{name} is {'not seen' if hidden else far}"
+            for far, hidden in zip(away, _rows(unseen[name]), strict=True)
+        )
+        return ~grip.holds & ~unseen[name] & lost if free else grip.carries, whys
 
 
-def _called(condition: Any, moment: Moment) -> tuple[Tensor, str]:
-    """For which robots (...) a function is true, and why it is not for others."""
+def _met(condition: Condition, moment: Moment) -> tuple[Tensor, Iterable[str]]:
+    """Which robots (...) meet a condition but those of objects, and why others do not."""
+    if condition == "arrived":
+        return moment.arrived, repeat("joints move, or are not at their reference")
+    if isinstance(condition, str):
+        link = condition.removeprefix(CONTACT)
+        known = link in moment.contacts
+        why = f"{link} touches nothing" if known else "no contact is measured there"
+        return moment.contacts.get(link, moment.no_robot), repeat(why)
     try:
         found = torch.as_tensor(condition(moment))
         if found.dtype == torch.bool:
-            return found.expand(moment.arrived.shape), "it is false"
+            return found.expand(moment.arrived.shape), repeat("it is false")
         why = f"it gives no bool but {found.dtype}"
     except Exception as error:  # of a user's function, which must not stop the loop
         why = f"it raised {error!r}"
-    return moment.no_robot, why
+    return moment.no_robot, repeat(why)
 
 
 def _rows(values: Tensor) -> Any:

@@ -159,7 +159,7 @@ def _stacked(parts: Sequence[Linearization], like: Tensor) -> Linearization:
     present = [part.present for part in parts if part.present is not None]
     return Linearization(
         _joined(jacobians, batch, 2),
-        _block_diagonal(matrices, batch),
+        gaussians.block_diagonal(matrices, batch),
         _joined(rows, batch, 1),
         _joined(present, batch, 1) if len(present) == len(parts) else None,
         _noise(parts, batch),
@@ -172,16 +172,6 @@ def _noise(parts: Sequence[Linearization], batch: torch.Size) -> Tensor | None:
     zeros = torch.zeros_like
     noise = [zeros(p.displacement) if p.noise is None else p.noise for p in parts]
     return _joined(noise, batch, 1)
-
-
-def _block_diagonal(matrices: Sequence[Tensor], batch: torch.Size) -> Tensor:
-    sizes = [matrix.shape[-2:] for matrix in matrices]
-    whole = matrices[0].new_zeros(*batch, *map(sum, zip(*sizes, strict=True)))
-    row = column = 0
-    for matrix, (rows, columns) in zip(matrices, sizes, strict=True):
-        whole[..., row : row + rows, column : column + columns] = matrix
-        row, column = row + rows, column + columns
-    return whole
 
 
 def _joined(parts: Sequence[Tensor], batch: torch.Size, rank: int) -> Tensor:

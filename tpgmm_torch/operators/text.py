@@ -28,16 +28,13 @@ __all__ = ["default_operators", "format_operator", "parse_operator"]
 
 TERM = re.compile(
     r"(canonical(:(?P<joints>[^\s:@+~,]+(,[^\s:@+~,]+)*))?"
-    r"|(?P<kind>position|(orientation|pose)(\[(?P<geometry>quaternion|tangent)\])?)"
+    r"|(?P<kind>position|(orientation|pose)(\[(?P<geometry>quaternion|tangent)\])?"
+    r"|wrench(\[(?P<axes>[xyz]+)\])?)"
     r":(?P<link>[^\s:@+~]+)(@(?P<held>held:)?(?P<frame>[^\s:@+~]+))?)"
     r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
 )
 #: What ``pose`` is short for.
 PAIR = re.compile(r"position:([^\s~]+) \+ orientation(\[tangent\])?:\1(?= |$)")
-FORCE = re.compile(
-    r"wrench(\[(?P<axes>x?y?z?)\])?:(?P<link>[^\s:@+~]+)@(?P<frame>[^\s:@+~]+)"
-    r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
-)
 GRAMMAR = (
     "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
     "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
@@ -74,10 +71,8 @@ def parse_operator(text: str) -> Operator:
 
 
 def _term(term: str, text: str) -> list[Operator]:
-    if force := FORCE.fullmatch(term):
-        return [_force(force)]
     match = TERM.fullmatch(term)
-    if match is None:
+    if match is None or (term.startswith("wrench") and (match["held"] or not match["frame"])):
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
     kind, frame = match["kind"], match["frame"]
     options: dict[str, Any] = {}
@@ -91,6 +86,9 @@ def _term(term: str, text: str) -> list[Operator]:
             f"operator {text!r}: {term!r} is a position [m] and an orientation [rad], of "
             "which each has a tolerance of its own: write both"
         )
+    if kind.startswith("wrench"):
+        axes = None if match["axes"] is None else tuple(map("xyz".index, match["axes"]))
+        return [Wrench(match["link"], frame, axes, **options)]
     place: list[str] = [match["link"]]
     position: Any = AbsolutePosition
     orientation: Any = AbsoluteOrientation
@@ -100,21 +98,6 @@ def _term(term: str, text: str) -> list[Operator]:
     geometry = match["geometry"] or "quaternion"
     one, other = position(*place, **options), orientation(*place, **options, geometry=geometry)
     return {"position": [one], "orientation": [other], "pose": [one, other]}[kind.split("[")[0]]
-
-
-def _force(match: re.Match[str]) -> Wrench:
-    axes = None if match["axes"] is None else tuple(map("xyz".index, match["axes"]))
-    given = {} if match["tolerance"] is None else {"tolerance": float(match["tolerance"])}
-    return Wrench(match["link"], match["frame"], axes, **given)
-
-
-def _joints_text(one: Any) -> str:
-    return "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
-
-
-def _force_text(one: Any) -> str:
-    axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
-    return f"wrench{axes}:{one.link}@{one.frame}"
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
@@ -145,9 +128,11 @@ def format_operator(operator: Operator) -> str:
         terms = " + ".join(map(format_operator, operator.operators))
         return PAIR.sub(r"pose\2:\1", terms)
     one: Any = operator
-    writer = {Canonical: _joints_text, Wrench: _force_text}.get(type(operator))
-    if writer is not None:
-        text = writer(one)
+    if type(operator) is Canonical:
+        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+    elif type(operator) is Wrench:
+        axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
+        text = f"wrench{axes}:{one.link}@{one.frame}"
     elif type(operator) in POSE_OPERATORS:
         kind = "position" if one.gain is None else "orientation"
         tangent = "[tangent]" if operator.rotation_vector_starts(None) else ""

@@ -96,49 +96,40 @@ class Wrench(Operator):
         return Linearization(jacobian, matrix, empty.new_zeros(*batch, 0))
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """``e^T R^T f`` for each axis ``e``, and 1 where ``|f|`` reaches ``contact``."""
-        force = self.force(state)
-        local = self.components(force, state, frames)
-        touches = (force.norm(dim=-1, keepdim=True) >= self.contact).to(local)
-        return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
-
-    def force(self, state: RobotState) -> Tensor:
-        """The force that the link exerts in a state (..., 3), in the base frame [N].
+        """``e^T R^T f`` for each axis ``e``, and 1 where ``|f|`` reaches ``contact``.
 
         Raises
         ------
         UnknownNameError
-            If none was measured.
+            If no wrench of the link was measured.
         """
         if self.link not in state.wrenches:
             where = "the demonstration (Demonstration(..., wrenches={link: (T, 6)}))"
             raise UnknownNameError("wrench", self.link, where, state.wrenches)
-        return state.wrenches[self.link][..., :3]
+        force = state.wrenches[self.link][..., :3]
+        local = self.components(force, state, frames)
+        touches = (force.norm(dim=-1, keepdim=True) >= self.contact).to(local)
+        return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
 
-    def pose(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Frame:
-        """The pose of the frame; only that of a link needs the state."""
-        links = () if state is None else state.links
-        if state is not None and self.frame in links:
+    def pose(self, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
+        """The pose of the frame."""
+        if self.frame in state.links:
             return state.pose(self.frame)
         if self.frame not in frames:
-            known = [*frames, *links]
+            known = [*frames, *state.links]
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
 
+    def directions(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """The axes (..., n_axes, 3) in the base frame."""
+        rotation = quaternions.to_matrix(self.pose(state, frames).orientation)
+        return rotation.mT[..., list(self._axes), :]
+
     def components(
-        self, vector: Tensor, state: RobotState | None, frames: Mapping[str, Frame]
+        self, vector: Tensor, state: RobotState, frames: Mapping[str, Frame]
     ) -> Tensor:
         """Components (..., n_axes) along the axes, of a vector (..., 3) in the base frame."""
-        turn = quaternions.conjugate(self.pose(state, frames).orientation)
-        return quaternions.rotate(turn, vector)[..., list(self._axes)]
-
-    def along_axes(
-        self, values: Tensor, state: RobotState, frames: Mapping[str, Frame]
-    ) -> Tensor:
-        """The vector in the base frame (..., 3) of values along the axes (..., n_axes)."""
-        local = values.new_zeros(*values.shape[:-1], 3)
-        local[..., list(self._axes)] = values
-        return quaternions.rotate(self.pose(state, frames).orientation, local)
+        return (self.directions(state, frames) @ vector.unsqueeze(-1)).squeeze(-1)
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """The tolerance for each axis; none of the contact."""

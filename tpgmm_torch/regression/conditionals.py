@@ -117,13 +117,7 @@ class Conditionals(_OfComponents):
     def stacked(cls, parts: Sequence[Conditionals]) -> Conditionals:
         """The coordinates of all parts side by side, which are independent given time."""
         time = parts[0].time_mean, parts[0].time_variance
-        sizes = [part.mean.shape[-1] for part in parts]
-        covariance = parts[0].mean.new_zeros(len(time[0]), sum(sizes), sum(sizes))
-        start = 0
-        for part, size in zip(parts, sizes, strict=True):
-            block = slice(start, start + size)
-            covariance[:, block, block] = part.covariance
-            start += size
+        covariance = gaussians.block_diagonal([p.covariance for p in parts], time[0].shape)
         mean = torch.cat([part.recentred(time[0]) for part in parts], -1)
         return cls(mean, torch.cat([part.gain for part in parts], -1), covariance, *time)
 

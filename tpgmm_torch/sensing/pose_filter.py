@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.frames import LEVER
-from tpgmm_torch.exceptions import DataError
 
 __all__ = ["OneEuro", "PoseFilter"]
 
@@ -57,10 +57,7 @@ class OneEuro:
     noise: float = 5e-4
 
     def __post_init__(self) -> None:
-        for name in ("cutoff", "slope", "speed_cutoff", "noise"):
-            value = getattr(self, name)
-            if not (value > 0 or (name == "slope" and value == 0)):
-                raise DataError(f"{name} of OneEuro is positive, got {value!r}")
+        check_positive(self, "slope")
 
 
 #: A quaternion's coordinates change half as fast as it turns.

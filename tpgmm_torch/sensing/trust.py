@@ -13,8 +13,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.states import changed
-from tpgmm_torch.exceptions import DataError
 
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
 
@@ -79,9 +79,7 @@ class Trust:
     turn_jump: float = 0.6
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise DataError(f"{name} of Trust is a positive number, got {value!r}")
+        check_positive(self)
 
 
 @dataclass(frozen=True, eq=False)

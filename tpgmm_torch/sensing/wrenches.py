@@ -73,22 +73,20 @@ class WrenchReading:
         """Whether it was measured at this tick."""
         return np.asarray(self.age == 0)
 
-    def update(self, measured: Array | None, dt: float | Array) -> Self:
+    def update(self, measured: Array, dt: float | Array) -> Self:
         """The reading after a tick.
 
         Parameters
         ----------
-        measured : array of shape (..., 6), optional
+        measured : array of shape (..., 6)
             Not finite for robots without a measurement, which keep what they had.
         dt : float or array of shape (...)
             Since the last tick [s].
         """
-        if measured is None:
-            return replace(self, age=np.asarray(self.age + dt))
         finite = np.asarray(np.isfinite(measured).all(-1))
         share = np.where(np.isinf(self.age), 1.0, 1 - np.exp(-dt / SMOOTHING_TIME))
-        step = np.where(np.expand_dims(finite, -1), measured - self.value, 0.0)
-        value = self.value + np.expand_dims(share, -1) * step
+        step = np.where(finite[..., None], measured - self.value, 0.0)
+        value = self.value + share[..., None] * step
         size = np.linalg.norm(value[..., :3], axis=-1)
         other = np.where(self.contact, size < RELEASE * self.threshold, size >= self.threshold)
         changing = np.where(finite, np.where(other, self.changing + dt, 0.0), self.changing)
@@ -98,7 +96,7 @@ class WrenchReading:
             value=value,
             contact=np.asarray(self.contact ^ turns),
             changing=np.where(turns, 0.0, changing),
-            age=np.asarray(np.where(finite, 0.0, self.age + dt)),
+            age=np.where(finite, 0.0, self.age + dt),
         )
 
 
@@ -145,12 +143,10 @@ class Wrenches:
         for link in dict.fromkeys((*readings, *given)):
             if link not in self.links:
                 raise UnknownNameError("link", link, "the robot", self.links)
-            measured = self._array(link, given.get(link))
-            known = readings.get(link)
-            if known is None:
-                threshold = self.thresholds.get(link, Wrench.contact)
-                known = WrenchReading.first(threshold, self.batch)
-            readings[link] = known.update(measured, dt)
+            known = readings.get(link) or WrenchReading.first(
+                self.thresholds.get(link, Wrench.contact), self.batch
+            )
+            readings[link] = known.update(self._array(link, given.get(link)), dt)
         return replace(self, readings=readings)
 
     def late(self, timeout: float) -> dict[str, Floats]:
@@ -161,19 +157,15 @@ class Wrenches:
         timeout : float
             For so long the last one is used [s].
         """
-        found = {}
-        for link, reading in self.readings.items():
-            robots = (reading.age > timeout) & np.isfinite(reading.age)
-            if robots.any():
-                text = f"the wrench of {link!r} is missing or not finite"
-                found[text] = np.where(robots, np.inf, 0.0)
-        return found
+        return {
+            f"the wrench of {link!r} is missing or not finite": np.where(robots, np.inf, 0.0)
+            for link, reading in self.readings.items()
+            if (robots := (reading.age > timeout) & np.isfinite(reading.age)).any()
+        }
 
-    def _array(self, link: str, values: Any) -> Array | None:
-        if values is None:
-            return None
+    def _array(self, link: str, values: Any) -> Array:
         given = values.numpy(force=True) if isinstance(values, Tensor) else values
-        array = np.asarray(given, np.float64)
+        array = np.asarray(np.full(6, np.nan) if given is None else given, np.float64)
         if array.shape[-1:] != (6,) or array.shape[:-1] not in ((), self.batch):
             raise ShapeError(
                 f"the wrench of {link!r} has shape {(*self.batch, 6)}, forces [N] before "

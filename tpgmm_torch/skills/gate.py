@@ -38,7 +38,7 @@ class Gate:
     fade : float, default=0.0
         If a skill follows that was learned separately: how long it takes to its beginning,
         which counts with the objects where they are by now, those in a hand too [s].
-    held, freed : tuple of Hold, default=()
+    holds : tuple of (str, Hold), default=()
         Which objects the conditions ``held`` and ``free`` ask for, and the links.
     name : str, default=""
         Of the skill that ends here.
@@ -50,14 +50,8 @@ class Gate:
     retries: int = 0
     back: float = 0.0
     fade: float = 0.0
-    held: tuple[Hold, ...] = ()
-    freed: tuple[Hold, ...] = ()
+    holds: tuple[tuple[str, Hold], ...] = ()
     name: str = ""
-
-    @property
-    def watched(self) -> tuple[Hold, ...]:
-        """Holds whose objects the conditions ask for."""
-        return self.held * ("held" in self.until) + self.freed * ("free" in self.until)
 
     @property
     def onward(self) -> float:

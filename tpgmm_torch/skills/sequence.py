@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import PurePath
 from typing import Any, Self
 
@@ -42,10 +42,10 @@ class Sequence(CompositeSkill):
     ----------
     skills : sequence of Skill
         Of one robot.
-    fade : float, optional
+    fade : float, default=0.0
         Seconds around a seam of parts in which the estimates of both are mixed, by a
-        minimum-jerk share, and between separate skills; by default 0.2, and 1.0 if there are
-        separate ones.
+        minimum-jerk share, and between separate skills; 0 stands for 0.2, and for 1.0 if there
+        are separate ones.
     until : str, callable, or sequence, default=()
         What has to be the case at the end of each skill for the next one to begin; one for
         all, or one of each: None, a condition, or several (in text joined by ``+``).
@@ -73,17 +73,22 @@ class Sequence(CompositeSkill):
     """
 
     skills: tuple[Skill, ...]
-    fade: float | None = None
+    fade: float = 0.0
     until: tuple[tuple[Any, ...], ...] = ()
     retry: tuple[tuple[int, int], ...] = ()
     timeout: float = 2.0
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        skills, names = tuple(self.skills), self._checked_names()
+        skills, count = tuple(self.skills), len(self.skills)
+        names = tuple(self.names) or tuple(map(str, range(count)))
+        if not count or not 0 < self.timeout < math.inf or not 0 <= self.fade < math.inf:
+            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
+        if len(set(names)) < count or len(names) > count:
+            raise DataError(f"{count} skills need a name each, got {list(names)}")
         parts = _are_parts(skills, self.fade or PARTS_FADE)
-        untils = _of_each("until", self.until or None, len(skills))
-        retries = _of_each("retry", self.retry or 0, len(skills))
+        untils = _of_each("until", self.until or None, count)
+        retries = _of_each("retry", self.retry or 0, count)
         for name, value in {
             "skills": skills,
             "names": names,
@@ -92,16 +97,6 @@ class Sequence(CompositeSkill):
             "retry": tuple(_retry(names, *each) for each in enumerate(retries)),
         }.items():
             object.__setattr__(self, name, value)
-
-    def _checked_names(self) -> tuple[str, ...]:
-        """Names of the skills, of which there are some; all settings are numbers."""
-        count, seconds = len(self.skills), (self.timeout, self.fade or self.timeout)
-        if not count or not all(0 < one < math.inf for one in seconds):
-            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
-        names = tuple(self.names) or tuple(map(str, range(count)))
-        if len(names) != count or len(set(names)) < count:
-            raise DataError(f"{count} skills need a name each, got {list(names)}")
-        return names
 
     @classmethod
     def parse(
@@ -125,11 +120,11 @@ class Sequence(CompositeSkill):
             If a part is not of this form, a name is not known, or as of the sequence.
         """
         found, untils, retries, names = [], [], [], []
-        for number, part in enumerate(map(str.strip, text.split(","))):
-            match = PART.fullmatch(part)
+        for number, part in enumerate(text.split(",")):
+            match = PART.fullmatch(part.strip())
             if match is None:
                 raise DataError(
-                    f"{part!r} in {text!r} is not of the form NAME [until CONDITION] "
+                    f"{part.strip()!r} in {text!r} is not of the form NAME [until CONDITION] "
                     "[retry NUMBER [from NAME]]"
                 )
             name, until, times, back = match.groups()
@@ -143,29 +138,26 @@ class Sequence(CompositeSkill):
         return cls(tuple(found), **several, **options)
 
     @cached_property
-    def _shifts(self) -> tuple[float, ...]:
-        """What is added to the time of each skill [s]."""
-        assert self.fade is not None
-        shifts = [0.0]
-        for one, other in pairwise(self.skills):
-            shared = _shares_clock(one, other, self.fade)
-            shifts.append(shifts[-1] + (0.0 if shared else one.end + self.fade - other.begin))
-        return tuple(shifts)
-
-    @cached_property
     def _separate(self) -> tuple[bool, ...]:
         """Which of the skills but the first do not share the clock of the one before."""
-        return tuple(one != other for one, other in pairwise(self._shifts))
+        pairs = pairwise(self.skills)
+        return tuple(not _shares_clock(one, other, self.fade) for one, other in pairs)
+
+    @cached_property
+    def _shifts(self) -> tuple[float, ...]:
+        """What is added to the time of each skill [s]."""
+        pairs = zip(self._separate, pairwise(self.skills), strict=True)
+        gaps = (own * (one.end + self.fade - other.begin) for own, (one, other) in pairs)
+        return tuple(accumulate(gaps, initial=0.0))
 
     @cached_property
     def _stretches(self) -> tuple[tuple[float, float], ...]:
         """When each skill is alone [s]."""
-        assert self.fade is not None
-        begins, ends = [self.begin], []
+        edges = [self.begin]
         for one, by, separate in zip(self.skills, self._shifts, self._separate, strict=False):
-            ends.append(one.end + by - (0.0 if separate else self.fade / 2))
-            begins.append(ends[-1] + self.fade)
-        return tuple(zip(begins, [*ends, self.end], strict=True))
+            stop = one.end + by - (0.0 if separate else self.fade / 2)
+            edges += [stop, stop + self.fade]
+        return tuple(zip(edges[::2], [*edges[1::2], self.end], strict=True))
 
     @property
     def end(self) -> float:
@@ -175,14 +167,9 @@ class Sequence(CompositeSkill):
     @cached_property
     def time(self) -> Tensor:
         """See :attr:`Skill.time`."""
-        assert self.fade is not None
-        grids = [
-            one.time + by if by else one.time
-            for one, by in zip(self.skills, self._shifts, strict=True)
-        ]
-        for one, separate, (_, stop) in zip(
-            self.skills, self._separate, self._stretches, strict=False
-        ):
+        grids = [one.time + by for one, by in zip(self.skills, self._shifts, strict=True)]
+        seams = zip(self.skills, self._separate, self._stretches, strict=False)
+        for one, separate, (_, stop) in seams:
             if separate:
                 step = (one.end - one.begin) / max(len(one.time) - 1, 1)
                 count = max(round(self.fade / step), 1) + 1
@@ -192,11 +179,10 @@ class Sequence(CompositeSkill):
     def time_of(self, index: int, time: Tensor) -> Tensor:
         """A time of the sequence, on the clock of one of its skills."""
         one, by = self.skills[index], self._shifts[index]
-        time = time - by if by else time
         before, after = (False, *self._separate, False)[index : index + 2]
         if not (before or after):
-            return time
-        return time.clamp(one.begin if before else None, one.end if after else None)
+            return time - by
+        return (time - by).clamp(one.begin if before else None, one.end if after else None)
 
     @cached_property
     def holds(self) -> tuple[Hold, ...]:
@@ -217,18 +203,17 @@ class Sequence(CompositeSkill):
     @cached_property
     def gates(self) -> tuple[Gate, ...]:
         """See :attr:`Skill.gates`: ends of skills at which something is waited for."""
-        assert self.fade is not None
-        gates: list[Gate] = []
-        separate = (*self._separate, False)
-        for k, (one, name) in enumerate(zip(self.skills, self.names, strict=True)):
-            by, (times, back) = self._shifts[k], self.retry[k]
-            inner = [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
-            own = Gate(
-                self._stretches[k][1], self.until[k], self.timeout, times,
-                self._stretches[back][0], separate[k] * self.fade,
-                _held(one), _freed(one), name,
-            )  # fmt: skip
-            gates += [*inner, own] if self.until[k] or separate[k] else inner
+        gates, separate = list[Gate](), (*self._separate, False)
+        for k, (one, by, until) in enumerate(
+            zip(self.skills, self._shifts, self.until, strict=True)
+        ):
+            gates += [replace(g, time=g.time + by, back=g.back + by) for g in one.gates]
+            times, back = self.retry[k]
+            if until or separate[k]:
+                holds = tuple(pair for pair in _ends(one) if pair[0] in until)
+                times_of = self._stretches[k][1], until, self.timeout, times
+                begin, fade = self._stretches[back][0], separate[k] * self.fade
+                gates.append(Gate(*times_of, begin, fade, holds, self.names[k]))
         return tuple(gates)
 
     @cached_property
@@ -253,34 +238,26 @@ class Sequence(CompositeSkill):
         first = self.skills[0].summary
         if first is None:
             return None
-        frames = [one.summary.frames for one in self.skills[1:] if one.summary is not None]
         later = {
             name: replace(frame, link=None)  # where a link is at the start of that skill
-            for own in reversed(frames)
-            for name, frame in own.items()
+            for one in reversed(self.skills[1:])
+            for name, frame in (one.summary.frames if one.summary else {}).items()
         }
         return replace(first, frames=later | {**first.frames})
 
     def shares(self, time: Tensor) -> Tensor:
         """Shares (..., n_skills) of the skills at times (...); their sum is 1."""
-        assert self.fade is not None
-        fades: float | Tensor = self.fade
-        seams = [one.end + by for one, by in zip(self.skills[:-1], self._shifts, strict=False)]
-        if any(self._separate):  # these begin at once, and the difference fades as it is then
-            widths = [self.fade * (SWITCH if own else 1.0) for own in self._separate]
-            seams = [
-                at + own * width / 2
-                for at, own, width in zip(seams, self._separate, widths, strict=True)
-            ]
-            fades = time.new_tensor(widths)
-        passed = (time.unsqueeze(-1) - time.new_tensor(seams)) / fades
+        seams = zip(self.skills, self._shifts, self._separate, strict=False)
+        # separate skills begin at once, and the difference fades as it is then
+        widths = [self.fade * (SWITCH if own else 1.0) for own in self._separate]
+        middles = [
+            one.end + by + own * width / 2
+            for (one, by, own), width in zip(seams, widths, strict=True)
+        ]
+        passed = (time.unsqueeze(-1) - time.new_tensor(middles)) / time.new_tensor(widths)
         passed = minimum_jerk(passed + 0.5)
         one = passed.new_ones(*passed.shape[:-1], 1)
         return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
-
-    def skill_at(self, time: float) -> Skill:
-        """The skill that has the largest share at a time [s]."""
-        return self.skills[int(self.shares(self.time.new_tensor(time)).argmax())]
 
     def observed(self, names: frozenset[str]) -> Skill | None:
         """See :meth:`Skill.observed`."""
@@ -294,21 +271,11 @@ def _shares_clock(one: Skill, other: Skill, fade: float) -> bool:
     return abs(other.begin - one.end) <= min(fade, (one.end - one.begin) / 2)
 
 
-def _held(skill: Skill) -> tuple[Hold, ...]:
-    """What a skill holds when it ends."""
-    return tuple(hold for hold in skill.holds if hold.begin < skill.end <= hold.end)
-
-
-def _freed(skill: Skill) -> tuple[Hold, ...]:
-    """What a skill has let go when it ends."""
-    kept = {hold.frame for hold in _held(skill)}
-    last = {hold.frame: hold for hold in skill.holds if hold.frame not in kept}
-    return tuple(last.values())
-
-
-def _open(end: float, edge: float) -> float:
-    """The end of a hold that lasts to the end of its skill, or beyond."""
-    return end if end < edge else math.inf
+def _ends(skill: Skill) -> tuple[tuple[str, Hold], ...]:
+    """What a skill holds when it ends, ``held``, and what it has let go, ``free``."""
+    free = {hold.frame: ("free", hold) for hold in skill.holds}
+    held = [hold for hold in skill.holds if hold.begin < skill.end <= hold.end]
+    return tuple((free | {hold.frame: ("held", hold) for hold in held}).values())
 
 
 def _held_on(holds: list[Hold], new: Hold) -> list[Hold]:
@@ -358,17 +325,10 @@ def _conditions(skill: Skill, given: Any) -> tuple[Condition, ...]:
 
 def _check_condition(one: Any, skill: Skill) -> None:
     """Refuse a condition that cannot be met."""
-    links = skill.kinematics.links
-    link = one.partition(CONTACT)[2] if isinstance(one, str) else ""
-    if link and link not in links:
-        raise UnknownNameError("link", link, f"the robot (until {one!r})", links)
-    if not link and one not in CONDITIONS:
-        raise DataError(
-            f"a condition is one of {[*CONDITIONS, CONTACT + 'LINK']} or a function, got "
-            f"{one!r}"
-        )
-    holds = {"held": _held, "free": _freed}.get(one)
-    if holds is not None and not holds(skill):
+    known = [*CONDITIONS, *(CONTACT + link for link in skill.kinematics.links)]
+    if one not in known:
+        raise UnknownNameError("condition", one, "a sequence, which may have a function", known)
+    if one in ("held", "free") and one not in dict(_ends(skill)):
         raise DataError(
             f"until {one!r}: no object is {one} by the end of this skill, of which the holds "
             f"are {[str(hold) for hold in skill.holds]}"

@@ -8,9 +8,8 @@ fades in and out, and its limits.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,9 @@ from torch import Tensor
 from tpgmm_torch.contact import Admittance
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.reach import Fade
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, TPGMMError
-from tpgmm_torch.motion.follower import Follower
-from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
@@ -35,13 +33,11 @@ from tpgmm_torch.torque.rows import (
     LocalGaussians,
     Mechanics,
     fastest,
-    force_axes,
     force_row,
     fused_torque,
-    jacobians,
 )
 
-__all__ = ["TorqueCommand", "TorqueController"]
+__all__ = ["TorqueController"]
 
 #: Time in which the torque of the skill fades when a state is not known [s]: ticks that are
 #: lost do nothing, and an arm of 1 rad/s moves by less than 3 degrees.
@@ -52,35 +48,10 @@ FASTEST_PACE = 2.0
 #: damping is of no use at 1 and unstable at 2, and contact takes half of the margin.
 LONGEST_TICK = 0.5
 
-NO_WRENCH = (
-    "the skill expects forces, and the first step has no wrench: forces are not corrected by "
-    "what is measured. Give wrenches={link: (..., 6)}, or TorqueGains(integral=0)"
-)
-NO_JOINTS = "joints were not read at this step"
-NO_VELOCITIES = "velocities are missing or not finite: step(dt, joints, velocities=...)"
-NO_TORQUE = "there was no finite torque (inertia, bias or frames)"
 LONG_TICK = (
     "a tick is longer than the {:.2g} ms that the damping allows: run at {:.0f} Hz or more, or "
     "with lower TorqueGains"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class TorqueCommand(Command):
-    """What is sent to robots with torque control.
-
-    Parameters
-    ----------
-    reference, velocity, time, estimate, codes, reasons, impedance, compute_novelty
-        As for :class:`~tpgmm_torch.control.command.Command`. Where forces are expected, the
-        reference is where the robot is.
-    relocalized, offset
-        Likewise.
-    torque : Tensor of shape (..., n_joints)
-        Of each joint, gravity and the bias of the motion included [N m or N].
-    """
-
-    torque: Tensor = field(kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +64,8 @@ class Drive:
         Last known ones.
     sent : Tensor of shape (..., n_joints)
         Torque beside the bias, before limits.
-    offset : Tensor of shape (..., n_joints)
-        Difference from what the skill asked for, when robots began or went on.
-    since : Tensor of shape (...)
-        Time since then [s].
+    fade : Fade
+        Of the difference from what the skill asked for, when robots began or went on.
     stopped : Tensor of bool of shape (...)
         Robots that are held.
     bias : Tensor of shape (..., n_joints)
@@ -114,8 +83,7 @@ class Drive:
 
     joints: Tensor
     sent: Tensor
-    offset: Tensor
-    since: Tensor
+    fade: Fade
     stopped: Tensor
     bias: Tensor
     rate: Tensor
@@ -162,8 +130,9 @@ class TorqueController(Controller):
     state, or with a tick that is too long for the damping, they fade to gravity and damping,
     with a reason in the command. They are within the limits of effort, and finite.
 
-    Where forces are expected, robots are where they are pushed to: no clock waits for one that
-    is held back, which pulls with its stiffness to where it should be by then.
+    Where forces are expected, robots are where they are pushed to, and so are references: no
+    clock waits for one that is held back, which pulls with its stiffness to where it should be
+    by then.
 
     Parameters
     ----------
@@ -204,34 +173,33 @@ class TorqueController(Controller):
         if self._inputs is None:
             raise DataError("trust=None follows every reading: torques need trust=Trust(...)")
         self._dynamics, self._gains = dynamics, gains
-        self._blend = float(settings.get("blend", 1.0))
         start, zero = self.reference, torch.zeros_like(self.reference)
-        self._gaussians, self._bodies = None, {}
+        self._local, self._tick, self._stiffness, n = None, None, None, start.shape[-1]
         if self._skill.expected_forces(self.time):
             if not isinstance(self._skill, Regression):
                 raise DataError(
                     f"torques of a {type(skill).__name__} that expects forces: there are those "
                     "of one fitted skill, model.skill; run its skills one after the other"
                 )
-            self._gaussians = LocalGaussians(self._skill, gains)
-            self._bodies = self._gaussians.bodies
-        n = start.shape[-1]
-        effort = getattr(dynamics, "effort", None) if effort is None else effort
-        self._effort = _checked_effort(math.inf if effort is None else effort, start)
+            self._local = LocalGaussians(self._skill, gains)
+            self._needs_wrench = gains.integral > 0
+        effort = getattr(dynamics, "effort", math.inf) if effort is None else effort
+        self._effort = torch.as_tensor(effort).to(start)
+        if self._effort.shape not in ((), (n,)) or not bool((self._effort > 0).all()):
+            raise DataError(f"effort has a torque above 0 for each of {n} joints: {effort!r}")
         inertia, bias = dynamics(start, zero)
         if inertia.shape != (*start.shape, n) or bias.shape != start.shape:
             raise ShapeError(
                 f"dynamics give an inertia {(*start.shape, n)} and a bias {tuple(start.shape)}"
                 f", got {tuple(inertia.shape)} and {tuple(bias.shape)}"
             )
-        at = jacobians(self._bodies, self._state(start), self.holding.frames)
-        first = Mechanics.at(inertia, at, zero, gains)
-        self._stiffness = gains.joint_stiffness(inertia), gains.link_stiffness(first.mobility)
-        none, time = zero.sum(-1), self.time + zero.sum(-1)
+        first, none = self._mechanics(self._state(start), inertia, zero), zero.sum(-1)
+        self._stiffness = first.stiffness
+        self._compliance = torch.linalg.inv(first.stiffness[..., :n, :n])
         self._drive = Drive(
-            start, zero, zero, none, none == 0, bias, first.rate, none > 0, time, none
-        )
-        self._tick: Any = None
+            start, zero, Fade.start(zero, float(settings.get("blend", 1.0))), none == 0, bias,
+            first.rate, none > 0, self.time + none, none,
+        )  # fmt: skip
 
     def step(
         self,
@@ -243,7 +211,7 @@ class TorqueController(Controller):
         holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
         wrenches: Mapping[str, Any] | None = None,
-    ) -> TorqueCommand:
+    ) -> Command:
         """Find the next torque.
 
         Parameters
@@ -260,15 +228,14 @@ class TorqueController(Controller):
 
         Returns
         -------
-        TorqueCommand
+        Command
+            With a ``torque``.
 
         Raises
         ------
         ShapeError, UnknownNameError
             As for :meth:`Controller.step`.
         """
-        if self.command is None and self._bodies and self._gains.integral and not wrenches:
-            warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=2)
         speeds, given = self._numbers(velocities, "velocities"), self._numbers(joints, "joints")
         self._tick, late = None, {**(ages or {}), **self._faults(dt, given, speeds)}
         command = super().step(dt, joints, frames, holds=holds, ages=late, wrenches=wrenches)
@@ -277,8 +244,8 @@ class TorqueController(Controller):
             known = self._tick.joints
             if self._gripping is not None:
                 known = torch.where(self._gripping, given, known)
-        self.command = driven = self._driven(command, known, speeds)
-        return driven
+        self.command = self._driven(command, known, speeds)
+        return self.command
 
     def _faults(self, dt: Any, given: Tensor, speeds: Tensor) -> dict[str, Any]:
         """Why robots are held, with infinite ages: what is missing, and ticks too long."""
@@ -286,44 +253,31 @@ class TorqueController(Controller):
         late = self._drive.rate * torch.nan_to_num(torch.as_tensor(seconds).to(speeds))
         longest = LONGEST_TICK / float(self._drive.rate.max().clamp_min(1e-9))
         faults = {
-            NO_VELOCITIES: ~speeds.isfinite().all(-1),
-            NO_JOINTS: ~given.isfinite().all(-1),
-            NO_TORQUE: self._drive.lost,
+            "velocities are missing or not finite: step(dt, joints, velocities=...)":
+                ~speeds.isfinite().all(-1),
+            "joints were not read at this step": ~given.isfinite().all(-1),
+            "there was no finite torque (inertia, bias or frames)": self._drive.lost,
             LONG_TICK.format(1e3 * longest, 1 / longest): late > LONGEST_TICK,
-        }
+        }  # fmt: skip
         return {
             reason: np.where(robots.numpy(force=True), np.inf, 0.0)
             for reason, robots in faults.items()
             if bool(robots.any())
         }
 
-    # Stages that are others where forces are expected: robots are where they are pushed to
-
-    def _estimate(self, tick: Any) -> Estimate:
-        if self._gaussians is None or self.command is None:
-            return super()._estimate(tick)
-        return self.command.estimate
-
-    def _reach(self, tick: Any, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
-        if self._gaussians is None:
-            return super()._reach(tick, found)
-        return found, self._postures(tick, measured=True), None
-
-    def _follow(
-        self, tick: Any, found: Estimate, wanted: Tensor, fitting: Follower | None
-    ) -> None:
-        if self._gaussians is None:
-            super()._follow(tick, found, wanted, fitting)
+    def _move(self, tick: Any) -> None:
+        """Where forces are expected, references are where robots are pushed to."""
+        self._tick = tick
+        if self._local is None:
+            super()._move(tick)
             return
-        self._found, passed = found, torch.as_tensor(tick.seconds).to(wanted).unsqueeze(-1)
+        wanted = self._postures(tick, measured=True)
+        passed = torch.as_tensor(tick.seconds).to(wanted).unsqueeze(-1)
         velocity = (wanted - self.reference) / passed
+        self._found = self._estimate(tick) if self.command is None else self.command.estimate
         self._following = replace(
             self._following, reference=wanted, wanted=wanted, velocity=velocity, lost=None
         )
-
-    def _send(self, tick: Any) -> Command:
-        self._tick = tick
-        return super()._send(tick)
 
     def _numbers(self, values: Any, name: str) -> Tensor:
         """Numbers (..., n_joints), which need not be finite."""
@@ -337,7 +291,7 @@ class TorqueController(Controller):
 
     # Stage drive
 
-    def _driven(self, command: Command, joints: Tensor, velocities: Tensor) -> TorqueCommand:
+    def _driven(self, command: Command, joints: Tensor, velocities: Tensor) -> Command:
         """The command with torques."""
         last, stopped, dt = self._drive, command.of(Status.HOLDING), self._drive.dt
         if self._tick is not None:
@@ -353,40 +307,42 @@ class TorqueController(Controller):
         left = (1 - dt / FADING_TIME).clamp_min(0.0).unsqueeze(-1)
         at_rest = held + left * (last.sent - held)
         # what is sent goes on where it was: the difference fades, as that of postures does
-        begins = last.stopped & ~stopped
-        offset = torch.where(begins.unsqueeze(-1), found.fused - last.sent, last.offset)
-        since = torch.where(begins, 0.0, last.since + dt)
-        share = since / self._blend if self._blend > 0 else torch.ones_like(since)
-        left = 1 - minimum_jerk(share).unsqueeze(-1)
-        sent = torch.where(stopped.unsqueeze(-1), at_rest, found.fused - left * offset)
+        fade = last.fade.again(last.stopped & ~stopped)
+        left_over, fade = fade.advance(last.sent, found.fused, dt, first=True)
+        fused = found.fused if left_over is None else found.fused + left_over
+        sent = torch.where(stopped.unsqueeze(-1), at_rest, fused)
         torque = (bias + sent).clamp(-self._effort, self._effort)
         free = torch.where(~stopped & (bias + sent == torque).all(-1), dt, 0.0)
         self._drive = Drive(
-            joints, sent, offset, since, stopped, bias, rate, ~finite,
+            joints, sent, fade, stopped, bias, rate, ~finite,
             command.time.expand_as(dt), dt, self._integrated(found, free, dt),
         )  # fmt: skip
-        values = {one.name: getattr(command, one.name) for one in fields(Command)}
-        return TorqueCommand(**values | {"estimate": found.estimate}, torque=torque)
+        return replace(command, estimate=found.estimate, torque=torque)
+
+    def _mechanics(self, state: RobotState, inertia: Tensor, velocities: Tensor) -> Mechanics:
+        """Of joints and, where forces are expected, links; at first with a new stiffness."""
+        jacobian = inertia[..., :0, :]
+        if self._local is not None:
+            jacobian = self._local.jacobian(state)
+        return Mechanics.at(inertia, jacobian, velocities, self._gains, self._stiffness)
 
     def _torques(
         self, command: Command, joints: Tensor, velocities: Tensor, dt: Tensor
     ) -> Found:
-        """Torques at a state; not a number where there are none."""
+        """Torques at a state; NaN where nothing gives one."""
         inertia, bias = self._dynamics(joints, velocities)
         try:
             state = self._state(joints)
-            at = jacobians(self._bodies, state, self.holding.frames)
-            mechanics = Mechanics.at(inertia, at, velocities, self._gains, self._stiffness)
-            held, rate = mechanics.held, mechanics.rate
-            found = Found(held, bias, held, rate, command.estimate)
-            if self._bodies:
-                return self._pressed(command, state, mechanics, dt, found)
+            at = self._mechanics(state, inertia, velocities)
+            found = Found(at.held, bias, at.held, at.rate, command.estimate)
+            if self._local is not None:
+                return self._pressed(command, state, at, dt, found)
             assert self._impedance is not None
             stiffness = command.stiffness_matrix
             damping = self._impedance.joints.damping(stiffness, inertia)
             pull = stiffness @ (command.reference - joints).unsqueeze(-1)
             fused = pull + damping @ (command.velocity - velocities).unsqueeze(-1)
-            rate = torch.maximum(rate, fastest(torch.linalg.solve(inertia, damping)))
+            rate = torch.maximum(found.rate, fastest(at.mobility @ damping))
             return replace(found, fused=fused.squeeze(-1), rate=rate)
         except TPGMMError:
             if not bool(self._drive.dt.any()):  # the first step
@@ -395,32 +351,26 @@ class TorqueController(Controller):
         return Found(lost, bias, lost, self._drive.rate, command.estimate)
 
     def _pressed(
-        self,
-        command: Command,
-        state: RobotState,
-        mechanics: Mechanics,
-        dt: Tensor,
-        found: Found,
+        self, command: Command, state: RobotState, at: Mechanics, dt: Tensor, found: Found
     ) -> Found:
         """The product of all rows."""
-        time, frames, last = command.time, self.holding.frames, self._drive
-        assert self._gaussians is not None
+        time, frames, last, local = command.time, self.holding.frames, self._drive, self._local
+        assert local is not None
         pace = torch.where(dt > 0, (time - last.time) / dt, 0.0).clamp(0.0, FASTEST_PACE)
-        rows = [self._gaussians.rows(time, pace, state, frames, mechanics)]
-        rates, forces = [found.rate], []
+        rows, rates = [local.rows(time, pace, state, frames, at)], [found.rate]
+        forces = list[tuple[ExpectedForce, Tensor]]()
         for one in self._skill.expected_forces(time):
-            axes = force_axes(one.operator, state, frames)
-            body = list(self._bodies).index((one.operator.link, None, False))
-            integral = last.integrals.get(one.operator, torch.zeros_like(one.force))
-            rows.append(force_row(one, axes, integral, body, mechanics, self._gains))
-            rates.append(rows[-1].rate)
+            operator, integral = one.operator, last.integrals.get(one.operator, 0.0)
+            axes, first = operator.directions(state, frames), local.first_row(operator.link)
+            row, rate = force_row(one, axes, integral, first, at, self._gains)
+            rows, rates = [*rows, row], [*rates, rate]
             forces.append((one, axes))
-        fused, covariance = fused_torque(rows, mechanics)
-        compliance = torch.linalg.inv(self._stiffness[0])
+        fused, covariance = fused_torque(rows, at)
+        step = (self._compliance @ fused.unsqueeze(-1)).squeeze(-1)
         estimate = Estimate(
-            state.joints + (compliance @ fused.unsqueeze(-1)).squeeze(-1),
-            compliance @ covariance @ compliance,
-            self._gaussians.skill.weights_at(time),
+            state.joints + step,
+            self._compliance @ covariance @ self._compliance,
+            local.skill.weights_at(time),
         )
         rate = torch.stack(rates).amax(0)
         return replace(found, fused=fused, rate=rate, estimate=estimate, forces=forces)
@@ -440,16 +390,8 @@ class TorqueController(Controller):
             fresh = torch.from_numpy(reading.fresh).to(passed.device)
             counts = torch.where(fresh & (one.share > 0.5), passed, 0.0).unsqueeze(-1)
             left = torch.exp(-(1 - one.share) * dt / Admittance.release).unsqueeze(-1)
-            value = self._drive.integrals.get(one.operator, torch.zeros_like(error)) * left
+            value = left * self._drive.integrals.get(one.operator, 0.0)
             most = one.force.norm(dim=-1, keepdim=True)
             value = value + self._gains.integral * counts * error
             values[one.operator] = value.clamp(-most, most)
         return values
-
-
-def _checked_effort(effort: Any, start: Tensor) -> Tensor:
-    """The largest torque of each joint, or of all."""
-    given, n = torch.as_tensor(effort).to(start), start.shape[-1]
-    if given.shape not in ((), (n,)) or not bool((given > 0).all()):
-        raise DataError(f"effort has a torque above 0 for each of {n} joints: {effort!r}")
-    return given

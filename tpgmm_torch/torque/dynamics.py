@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from typing import Any, Protocol
 from xml.etree import ElementTree
@@ -12,7 +11,8 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.obstacles.shapes import mujoco_module
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
@@ -51,7 +51,7 @@ class MujocoDynamics:
     ----------
     robot : Robot
         Its joints are looked up by name.
-    model : mujoco.MjModel, path or str, optional
+    model : path or str, optional
         MJCF or URDF with the masses of the robot, a file or the text itself; by default the
         URDF of the robot, if it has masses. A robot read from an MJCF keeps none of them.
 
@@ -72,27 +72,17 @@ class MujocoDynamics:
     """
 
     def __init__(self, robot: Robot, model: Any = None) -> None:
-        try:
-            import mujoco
-        except ImportError as error:
-            raise DependencyError(
-                "MujocoDynamics needs MuJoCo: pip install 'tpgmm-torch[simulation]'"
-            ) from error
-        self._mujoco, source = mujoco, robot.model.text if model is None else model
-        self._model = model = _compiled(mujoco, source)
+        self._mujoco = mujoco = mujoco_module()
+        self._model = model = _compiled(robot.model.text if model is None else model)
         self._data, names = mujoco.MjData(model), robot.joint_names
         known = [model.joint(j).name for j in range(model.njnt)]
         for name in names:
             if name not in known:
                 raise UnknownNameError("joint", name, "the model of the dynamics", known)
-        self._map(robot, known)
-        efforts = _efforts(mujoco, model)[[known.index(name) for name in names]]
+        efforts = _efforts(model)[[known.index(name) for name in names]]
         self.effort = torch.from_numpy(efforts).to(robot.lower)
-
-    def _map(self, robot: Robot, known: list[str]) -> None:
-        """Joints of the model as functions of the joint vector."""
-        model, names = self._model, robot.joint_names
-        # what the robot does not know, as objects, stays where it begins
+        # joints of the model are functions of the joint vector; what the robot does not know,
+        # as objects, stays where it begins
         moved = [name for name in known if name in robot.model.movable]
         index, locked = [known.index(name) for name in moved], robot.config()["locked"]
         self._places, rows = model.jnt_qposadr[index], model.jnt_dofadr[index]
@@ -128,19 +118,16 @@ class MujocoDynamics:
         return moved @ columns, outside @ columns
 
 
-def _compiled(mujoco: Any, source: Any) -> Any:
+def _compiled(source: Any) -> Any:
     """A model of its own, without contacts."""
+    mujoco, root = mujoco_module(), parse_xml(description_text(source))
+    for link in root.iter("link"):  # of a URDF, without the meshes that MuJoCo would look for
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
     try:
-        if isinstance(source, mujoco.MjModel):
-            model = copy.deepcopy(source)
-        elif (root := parse_xml(description_text(source))).tag == "mujoco":
-            of_file = not is_text(source)
-            read = mujoco.MjModel.from_xml_path if of_file else mujoco.MjModel.from_xml_string
-            model = read(os.fspath(source) if of_file else description_text(source).strip())
-        else:  # without the meshes that MuJoCo would look for
-            for link in root.iter("link"):
-                for shape in [*link.findall("visual"), *link.findall("collision")]:
-                    link.remove(shape)
+        if root.tag == "mujoco" and not is_text(source):  # meshes are beside it
+            model = mujoco.MjModel.from_xml_path(os.fspath(source))
+        else:
             model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, "unicode"))
     except (ValueError, mujoco.FatalError) as error:
         raise DataError(
@@ -151,19 +138,18 @@ def _compiled(mujoco: Any, source: Any) -> Any:
     return model
 
 
-def _efforts(mujoco: Any, model: Any) -> Array:
+def _efforts(model: Any) -> Array:
     """Largest torques of joints (njnt,), of their own and of the motors that drive them."""
-    free = np.array([-np.inf, np.inf])
 
     def largest(limited: Array, ranges: Array) -> Array:
-        found: Array = np.abs(np.where(limited.astype(bool)[:, None], ranges, free)).min(-1)
+        found: Array = np.where(limited, np.abs(ranges).min(-1), np.inf)
         return found
 
     limits = largest(model.jnt_actfrclimited, model.jnt_actfrcrange)
-    forces = largest(model.actuator_forcelimited, model.actuator_forcerange)
-    controls = model.actuator_gainprm[:, :1] * model.actuator_ctrlrange
     is_motor = ~model.actuator_biasprm.any(-1) & (model.actuator_ctrllimited > 0)
-    forces = np.minimum(forces, largest(is_motor, controls)) * np.abs(model.actuator_gear[:, 0])
-    drives = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    controls = largest(is_motor, model.actuator_gainprm[:, :1] * model.actuator_ctrlrange)
+    forces = largest(model.actuator_forcelimited, model.actuator_forcerange)
+    forces = np.minimum(forces, controls) * np.abs(model.actuator_gear[:, 0])
+    drives = model.actuator_trntype == int(mujoco_module().mjtTrn.mjTRN_JOINT)
     np.minimum.at(limits, model.actuator_trnid[drives, 0], forces[drives])
     return limits

@@ -44,25 +44,24 @@ def with_force_axes(
     DataError
         If no force does no work, or a link is never in contact.
     """
+    return tuple(
+        _completed(one, motions) if isinstance(one, Wrench) and one.axes is None else one
+        for one in operators
+    )
 
-    def completed(operator: Operator) -> Operator:
-        if not isinstance(operator, Wrench) or operator.axes is not None:
-            return operator
-        shares, sizes = shares_of_work(operator, motions)
-        found = (shares < NO_WORK) & (sizes >= operator.contact)
-        if not bool(found.any()):
-            shown = ", ".join(
-                f"{axis} {share:.2f} at {size:.1f} N"
-                for axis, share, size in zip("xyz", shares, sizes, strict=True)
-            )
-            raise DataError(
-                f"no force of {operator.link!r} in {operator.frame!r} does no work (share of "
-                f"work: {shown}; below {NO_WORK} and from {operator.contact} N on): is the "
-                "frame aligned with the surface? Else give the axes, Wrench(..., axes=[2])"
-            )
-        return replace(operator, axes=tuple(torch.nonzero(found)[:, 0].tolist()))
 
-    return tuple(map(completed, operators))
+def _completed(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
+    shares, sizes = (each.tolist() for each in shares_of_work(operator, motions))
+    every = list(zip("xyz", shares, sizes, strict=True))
+    found = [s < NO_WORK and size >= operator.contact for _, s, size in every]
+    if not any(found):
+        shown = ", ".join(f"{axis} {share:.2f} at {size:.1f} N" for axis, share, size in every)
+        raise DataError(
+            f"no force of {operator.link!r} in {operator.frame!r} does no work (share of "
+            f"work: {shown}; below {NO_WORK} and from {operator.contact} N on): is the "
+            "frame aligned with the surface? Else give the axes, Wrench(..., axes=[2])"
+        )
+    return replace(operator, axes=tuple(axis for axis in range(3) if found[axis]))
 
 
 def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:

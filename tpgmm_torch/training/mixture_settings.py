@@ -51,11 +51,8 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
 def _check_forces(checked: tuple[Operator, ...]) -> None:
     """Refuse forces that do not stand behind what says something of the joints."""
     joints = of_joints(checked)
-    if (
-        not joints
-        or checked[: len(joints)] != joints
-        or not all(leaf.constrains_joints for leaf in leaves(joints))
-    ):
+    alone = all(leaf.constrains_joints for leaf in leaves(joints))
+    if not joints or checked[: len(joints)] != joints or not alone:
         raise DataError(
             "Wrench() says nothing of the joints: it stands by itself, in no Stack, behind at "
             f"least one operator that does, got {list(checked)}"
