@@ -50,7 +50,7 @@ _NO_REASONS: Mapping[tuple[int, ...], str] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """What is sent to a batch of robots at one tick.
+    """Command to a batch of robots at one tick.
 
     What a tick needs not be asked for every time (stiffness, damping, the status in words) is
     worked out when it is.

@@ -94,7 +94,7 @@ INSTANT = 1e-6
 
 @dataclass
 class _Tick:
-    """What is known of one tick.
+    """Knowledge of one tick.
 
     Parameters
     ----------
@@ -262,13 +262,13 @@ class Controller:
 
     @property
     def _sent(self) -> Following | Follower:
-        """What is sent: the ordinary references, or those that keep clear of obstacles."""
+        """Sent references: the ordinary ones, or those that keep clear of obstacles."""
         sent = None if self._avoidance is None else self._avoidance.sent
         return self._following if sent is None else sent
 
     @property
     def holding(self) -> Holding:
-        """What the robots hold, and where objects were last free."""
+        """Objects that the robots hold, and where objects were last free."""
         return self._holds.holding
 
     @property
@@ -530,7 +530,7 @@ class Controller:
         )
 
     def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
-        """What the conditions of gates are asked of."""
+        """State that the conditions of gates are judged by."""
         reference, velocity = self.reference.detach(), self._following.velocity.detach()
         readings = torch.nan * reference if tick.joints is None else tick.joints
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
@@ -544,7 +544,7 @@ class Controller:
         )  # fmt: skip
 
     def _hold(self, tick: _Tick, frames: Any, holds: Any) -> None:
-        """What the robots hold."""
+        """Update of the objects that the robots hold."""
         seen = None if frames is None else dict(self._frames)
         stands, seconds = self._postures(tick, measured=True), _each(tick.seconds)
         self._holds = self._holds.advance(tick.time, stands, seen, holds, seconds, self._inputs)
@@ -562,7 +562,7 @@ class Controller:
         )  # fmt: skip
 
     def _estimate(self, tick: _Tick) -> Estimate:
-        """What the skill says."""
+        """Estimate by the skill."""
         at: Any = self._postures(tick, self._feedback == "measured")
         at = self._state(at) if self._is_changed else at
         last = self.command.estimate if self.command is not None and self._trusts else None

@@ -31,7 +31,7 @@ SHARE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What conditions are asked of, at one tick.
+    """State that conditions are judged by, at one tick.
 
     Parameters
     ----------

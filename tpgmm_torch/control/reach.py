@@ -71,7 +71,7 @@ class Fade:
     def advance(
         self, reference: Tensor, estimate: Tensor, dt: float | Tensor, first: bool
     ) -> tuple[Tensor | None, Self]:
-        """What is left of the gap (..., n_joints), None if nothing is, and the next tick's.
+        """Rest of the gap (..., n_joints), None if nothing is left, and the next tick's.
 
         Parameters
         ----------

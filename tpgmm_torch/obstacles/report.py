@@ -56,7 +56,7 @@ def find_contacts(
     frames: Mapping[str, Frame] | None = None,
     holds: Sequence[Hold] = (),
 ) -> list[Contact]:
-    """What touches what in a motion, in the order of time.
+    """Contacts in a motion, in the order of time.
 
     Parameters
     ----------

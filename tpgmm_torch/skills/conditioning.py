@@ -95,7 +95,7 @@ def covariance_between(one: Tensor, other: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """What one via-point asks for."""
+    """Request of one via-point."""
 
     term: Residual
     coordinates: Tensor
@@ -193,7 +193,7 @@ class Conditioning:
         bounds: tuple[Tensor, Tensor] | None = None,
         attach: Callable[[RobotState], RobotState] | None = None,
     ) -> tuple[Estimate, Self]:
-        """What the joints are at ``time``, given the via-points.
+        """Estimate of the joints at ``time``, given the via-points.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class Conditioning:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What the regression says elsewhere in time, of robots as they are."""
+    """Regression at another time, of robots as they are."""
 
     regression: Regression
     frames: Mapping[str, Frame]

@@ -145,7 +145,7 @@ class Sequence(CompositeSkill):
 
     @cached_property
     def _shifts(self) -> tuple[float, ...]:
-        """What is added to the time of each skill [s]."""
+        """Seconds added to the time of each skill."""
         pairs = zip(self._separate, pairwise(self.skills), strict=True)
         gaps = (own * (one.end + self.fade - other.begin) for own, (one, other) in pairs)
         return tuple(accumulate(gaps, initial=0.0))
@@ -272,7 +272,7 @@ def _shares_clock(one: Skill, other: Skill, fade: float) -> bool:
 
 
 def _ends(skill: Skill) -> tuple[tuple[str, Hold], ...]:
-    """What a skill holds when it ends, ``held``, and what it has let go, ``free``."""
+    """Objects that a skill holds when it ends, ``held``, and that it has let go, ``free``."""
     free = {hold.frame: ("free", hold) for hold in skill.holds}
     held = [hold for hold in skill.holds if hold.begin < skill.end <= hold.end]
     return tuple((free | {hold.frame: ("held", hold) for hold in held}).values())

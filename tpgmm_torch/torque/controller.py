@@ -56,7 +56,7 @@ LONG_TICK = (
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What is remembered of the last tick; immutable.
+    """Memory of the last tick; immutable.
 
     Parameters
     ----------

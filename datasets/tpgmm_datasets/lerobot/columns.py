@@ -193,7 +193,7 @@ def frame_columns(
 
 
 def pose_values(frame: Frame, rows: int) -> Array:
-    """Position and quaternion of a frame at each of so many rows, shape (rows, 7)."""
+    """Position and quaternion of a frame at each row, shape (rows, 7)."""
     pose = np.concatenate([as_array(frame.position), as_array(frame.orientation)], axis=-1)
     return np.broadcast_to(pose, (rows, len(POSE_PARTS)))
 

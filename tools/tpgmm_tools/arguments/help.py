@@ -109,7 +109,7 @@ HELP_ALL = Parameter(
 
 
 def _info(one: Parameter) -> Any:
-    """What typer is given about a parameter."""
+    """Settings of typer about a parameter."""
     return get_args(one.annotation)[1]
 
 
@@ -134,7 +134,7 @@ def _syntax(one: Parameter) -> str:
 
 
 def _explained(one: Parameter, every: bool) -> str:
-    """What a parameter is for: all of it, or one sentence."""
+    """Help of a parameter: all of it, or one sentence."""
     text = (_info(one).help or "").replace("\\[", "[")
     if not every:
         text = re.split(r"(?<=[.;:])\s", text)[0].rstrip(".;:") + "."

@@ -34,7 +34,7 @@ __all__ = ["Choices", "aligner", "learn", "operators_or_default", "parse_parts",
 
 @dataclass(frozen=True)
 class Choices:
-    """What is found in the demonstrations instead of being given.
+    """Choices that are found in the demonstrations instead of being given.
 
     Parameters
     ----------

@@ -142,7 +142,7 @@ def _cell(value: Any, parts: tuple[str, ...], digits: int) -> str:
 
 
 def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
-    """What the numbers say, in sentences.
+    """Sentences about the numbers of the demo.
 
     Parameters
     ----------
