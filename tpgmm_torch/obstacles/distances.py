@@ -8,9 +8,8 @@ first reaches there.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -112,10 +111,6 @@ class Geometry:
         self._sphere = np.where(plane, ENDLESS, model.geom_rbound)
         self._middle, self._half = model.geom_aabb[:, :3].copy(), model.geom_aabb[:, 3:].copy()
         self.select(pairs)
-
-    def copy(self) -> Self:
-        """The same solids, of which other pairs may be selected."""
-        return copy.copy(self)
 
     def select(self, pairs: Indices) -> None:
         """Let ``pairs`` of shape (P, 2) be those that count."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
+    from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
     "Alignments", "DataOptions", "RobotOptions", "align", "command",
@@ -323,16 +324,14 @@ def align(
     return aligned
 
 
-def scene(
-    file: Path, kinematics: Kinematics, visuals: bool, shown: list[Demonstration]
-) -> Scene:
+def scene(file: Path, skill: Skill, visuals: bool, shown: list[Demonstration]) -> Scene:
     """The robot among the obstacles of a ``file``; what is allowed is listed."""
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.obstacles import Scene
 
     if not file.is_file():
         raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
-    scene = Scene(kinematics, file, visuals=visuals).allowing(shown)
+    scene = Scene(skill.kinematics, file, visuals=visuals).allowing(shown).allowing_skill(skill)
     for (one, other), reason in scene.allowed.items():
         typer.echo(f"allowed: {one} and {other} ({reason})")
     return scene

@@ -113,7 +113,7 @@ def view(
     objects = {name: parse_shape(shape) for name, _, shape in pairs}
     how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
     if obstacles is not None:
-        how["obstacles"] = options.scene(obstacles, fitted.kinematics_, visuals, demonstrations)
+        how["obstacles"] = options.scene(obstacles, fitted.skill, visuals, demonstrations)
     if live:
         at = {"host": host, "port": port, "first": situation, **how}
         with (
