@@ -306,7 +306,7 @@ class Scene:
             _pair([self.shapes[i].name for i in both]) for both in self.geometry.pairs.tolist()
         ]
         keep = [name not in self.allowed for name in names]
-        self.geometry.select(self.geometry.pairs[np.array(keep, bool)])
+        self.geometry.pairs = self.geometry.pairs[np.array(keep, bool)]
         self._pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
         self._needed = np.array(
             [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self._pairs]

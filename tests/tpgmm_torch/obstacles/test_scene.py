@@ -121,7 +121,7 @@ def test_bounds_never_exceed_distances(scene):
     joints = postures(scene.robot, 20, seed=2)
     placed = scene.geometry.place(joints, scene.objects(None, {}, 20))
     near = scene.geometry.near(placed, np.full((20, len(scene.pairs)), 2.0))
-    least = scene.geometry.least(placed)[near.robot, near.pair]
+    least = scene.geometry.least(placed, near.robot, near.pair)
     assert (least <= np.maximum(near.distance, 0.0) + 1e-9).all()
     assert np.mean(least > 0.05) > 0.5  # most need no distance at all
 
