@@ -135,9 +135,16 @@ class EpisodeSummary:
 
 
 def differing(postures: Array) -> Array:
-    """At most ``POSTURES`` rows of (N, n_joints), each as far as can be from those before it.
+    """At most ``POSTURES`` postures, each as far as can be from those before it.
 
-    How far is the largest difference of a joint.
+    Parameters
+    ----------
+    postures : ndarray of shape (N, n_joints)
+        Of which the largest difference of a joint is the distance.
+
+    Returns
+    -------
+    ndarray of shape (P, n_joints)
     """
     away, chosen = np.abs(postures - postures[0]).max(1), [0]
     while len(chosen) < POSTURES and away.max(initial=0.0) > 0:

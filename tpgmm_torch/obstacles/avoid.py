@@ -46,10 +46,6 @@ __all__ = ["Avoidance"]
 #: How exactly hands are led [m, rad], and joints, which are free to give way, and whose ways
 #: to rest are rather as long as ordinary ones: nothing trembles beside an edge [rad or m].
 HAND, TURN, JOINT, CALM = 0.005, 0.05, 0.5, 0.05
-#: Hands that are further off than this, in these units, pull no harder, or a blocked robot
-#: trembles from edge to edge; where the ordinary reference goes on, its joints by way [rad],
-#: they may pull (1 + way / STEP) times as hard, or robots are slow to join it.
-PULL, STEP = 4.0, 0.005
 #: Share of the room to an obstacle that is used up before a robot could stand still.
 SHARE = 0.5
 #: Speed at which a robot leaves what it is too near to [m/s].
@@ -298,9 +294,6 @@ class _Tick:
             own &= np.minimum(rows * low[row], rows * high[row]).sum(1) < least.max(0)
             # the way of this tick is linear in the way to rest
             start = rows[own] @ (first[row] - slope[row] * low[row])
-            most = PULL * (1 + np.abs(onwards[row]).max() / STEP)
-            pull = np.linalg.norm(error.reshape(-1, 6), axis=1) / most
-            error = error / np.maximum(pull, 1.0).repeat(6)
             way, weights = _nearest(
                 jacobian.T @ jacobian + np.eye(shape[1]) * (1 / JOINT**2 + 1 / CALM**2),
                 jacobian.T @ error

@@ -216,9 +216,7 @@ class Geometry:
         return way[..., 0]
 
 
-def _of_links(
-    robot: Robot, links: Sequence[str]
-) -> tuple[Robot | None, list[int] | slice]:
+def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[int] | slice]:
     """The kinematics of links that carry solids, and the columns of its joints.
 
     Coordinates have units of their own: what they move stands where it is at 0.

@@ -70,6 +70,10 @@ class Scene:
         Pairs that do not count, in alphabetical order, and why.
     closer : mapping of (str, str) to float
         Pairs that may come half as near as demonstrations bring them, which is this [m].
+    pairs : tuple of (str, str)
+        Names of the pairs of solids that count, (P,).
+    needed : ndarray of shape (P,)
+        Distances that they keep [m].
 
     Raises
     ------
@@ -131,24 +135,14 @@ class Scene:
         """Of links, objects and obstacles that have solids."""
         return tuple(dict.fromkeys(shape.name for shape in self.shapes))
 
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        """Names of the pairs of solids that count, (P,)."""
-        return self._pairs
-
     def label(self, pair: int) -> str:
         """The names of a pair in words: "l_forearm / table"."""
-        return " / ".join(self.links_first(self._pairs[pair]))
+        return " / ".join(self.links_first(self.pairs[pair]))
 
     def links_first(self, pair: Pair) -> Pair:
         """A pair of names, of which a link of the robot is the first."""
         one, other = sorted(pair, key=lambda name: name not in self.robot.model.links)
         return one, other
-
-    @property
-    def needed(self) -> Array:
-        """Distances (P,) that these keep [m]."""
-        return self._needed
 
     def objects(
         self, state: RobotState | None, frames: Mapping[str, Frame], batch: int
@@ -217,13 +211,11 @@ class Scene:
         near = self.geometry.near(placed, np.full(shape, within))
         found: dict[Pair, Array] = {}
         for robot, pair, distance in zip(near.robot, near.pair, near.distance, strict=True):
-            row = found.setdefault(self._pairs[pair], np.full(len(postures), within))
+            row = found.setdefault(self.pairs[pair], np.full(len(postures), within))
             row[robot] = min(row[robot], distance)
         return found
 
-    def allowing(
-        self, demonstrations: Iterable[Demonstration], surroundings: bool = False
-    ) -> Self:
+    def allowing(self, demonstrations: Iterable[Demonstration]) -> Self:
         """The scene with pairs allowed that come near each other in demonstrations.
 
         Pairs that overlap there do not count any more; others may come half as near as they
@@ -232,9 +224,7 @@ class Scene:
         Parameters
         ----------
         demonstrations : iterable of Demonstration
-            With their frames and holds.
-        surroundings : bool, default=False
-            Whether the obstacles stood there too, so that pairs with them count.
+            With their frames and holds. What stands still in the scene did not stand there.
         """
         least: dict[Pair, float] = {}
         for one in demonstrations:
@@ -245,7 +235,7 @@ class Scene:
             near = self.distances(chosen.joints, frames, 2 * self.clearance, state)
             for pair, values in near.items():
                 least[pair] = min(least.get(pair, np.inf), float(values.min()))
-        return self._near_each_other(least, surroundings)
+        return self._near_each_other(least)
 
     def allowing_skill(self, skill: Any) -> Self:
         """The scene with links allowed that come near each other in a skill's demonstrations.
@@ -274,9 +264,9 @@ class Scene:
         near = self.distances(postures, self._away, 2 * self.clearance)
         return self._near_each_other({pair: float(d.min()) for pair, d in near.items()})
 
-    def _near_each_other(self, least: Mapping[Pair, float], surroundings: bool = False) -> Self:
+    def _near_each_other(self, least: Mapping[Pair, float]) -> Self:
         """The scene with pairs allowed that were shown as near as that."""
-        fixed = {one.name for one in self.shapes if one.carrier is None and not surroundings}
+        fixed = {one.name for one in self.shapes if one.carrier is None}
         least = {pair: d for pair, d in least.items() if fixed.isdisjoint(pair)}
         other = copy.copy(self)
         other.closer = MappingProxyType(
@@ -307,9 +297,9 @@ class Scene:
         ]
         keep = [name not in self.allowed for name in names]
         self.geometry.pairs = self.geometry.pairs[np.array(keep, bool)]
-        self._pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
-        self._needed = np.array(
-            [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self._pairs]
+        self.pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
+        self.needed = np.array(
+            [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self.pairs]
         )
 
     def _always(self) -> dict[Pair, str]:
