@@ -11,7 +11,7 @@ import torch
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, listed
-from tpgmm_torch.checks.training import EpisodeSummary, PathSummary
+from tpgmm_torch.checks.training import EpisodeSummary, PathSummary, differing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST
 from tpgmm_torch.data.frames import Frame
@@ -186,6 +186,9 @@ class TrainingSummary:
     frames : mapping of str to FrameSummary
     events : mapping of str to float
         Median times of events that all demonstrations have, as shares of the duration.
+    postures : sequence of sequence of float
+        Some of all demonstrations (P, n_joints), to find links that come near each other; none
+        in files of before they were kept [rad or m].
     """
 
     n_demonstrations: int
@@ -197,6 +200,7 @@ class TrainingSummary:
     limit: float
     frames: Mapping[str, FrameSummary]
     events: Mapping[str, float]
+    postures: Sequence[Sequence[float]] = ()
 
     def __repr__(self) -> str:
         return (
@@ -214,6 +218,7 @@ class TrainingSummary:
             start_low=(n,),
             start_high=(n,),
             compared=(len({*compared}),),
+            postures=(len(self.postures), n) if self.postures else (0,),
         )
         if type(count) is not int or count < 1 or self.limit <= 0:
             raise DataError(f"there are {count} demonstrations, and the limit is {self.limit}")
@@ -260,6 +265,7 @@ class TrainingSummary:
                 name: float(np.median([episode.events[name] for episode in episodes]))
                 for name in sorted(common, key=list(episodes[0].events).index)
             },
+            differing(np.concatenate([one.postures for one in episodes])).round(4).tolist(),
         )
 
     def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:

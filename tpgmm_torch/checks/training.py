@@ -22,7 +22,7 @@ from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "FAR", "IMPOSSIBLE", "EpisodeSummary", "PathSummary", "check", "summarize",
+    "FAR", "IMPOSSIBLE", "EpisodeSummary", "PathSummary", "check", "differing", "summarize",
     "unit_findings",
 ]  # fmt: skip
 
@@ -37,6 +37,9 @@ FAR = 10.0
 SLOWEST_STEP = 0.5
 #: Demonstrations on one clock begin together and last equally, up to this share.
 ONE_CLOCK = 0.05
+#: Postures that a skill keeps of its demonstrations: of 3,000 of two robots, links are as near
+#: each other in these as in all, within 2 mm.
+POSTURES = 50
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,8 @@ class EpisodeSummary:
         Those that are poses.
     events : mapping of str to float
         As shares of the duration.
+    postures : array of shape (P, n_joints)
+        Some that differ, at most ``POSTURES``.
     """
 
     begin: float
@@ -107,6 +112,7 @@ class EpisodeSummary:
     high: Array
     frames: Mapping[str, PathSummary]
     events: Mapping[str, float]
+    postures: Array
 
     @classmethod
     def of(cls, demonstration: Demonstration) -> EpisodeSummary:
@@ -124,7 +130,27 @@ class EpisodeSummary:
             joints.max(axis=0),
             {name: PathSummary.of(frame) for name, frame in demonstration.frames.items()},
             {name: (at - begin) / whole for name, at in demonstration.events.items()},
+            differing(joints),
         )
+
+
+def differing(postures: Array) -> Array:
+    """At most ``POSTURES`` postures, each as far as can be from those before it.
+
+    Parameters
+    ----------
+    postures : ndarray of shape (N, n_joints)
+        Of which the largest difference of a joint is the distance.
+
+    Returns
+    -------
+    ndarray of shape (P, n_joints)
+    """
+    away, chosen = np.abs(postures - postures[0]).max(1), [0]
+    while len(chosen) < POSTURES and away.max(initial=0.0) > 0:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.abs(postures - postures[chosen[-1]]).max(1))
+    return postures[chosen]
 
 
 def summarize(

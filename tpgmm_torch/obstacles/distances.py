@@ -8,9 +8,8 @@ first reaches there.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -109,19 +108,10 @@ class Geometry:
         self.radius = np.array(
             [max(reach[self.carrier == k], default=0.0) for k in range(len(carriers))]
         )
-        self._sphere = np.where(plane, ENDLESS, model.geom_rbound)
+        self._radius = np.where(plane, ENDLESS, model.geom_rbound)
         self._middle, self._half = model.geom_aabb[:, :3].copy(), model.geom_aabb[:, 3:].copy()
-        self.select(pairs)
-
-    def copy(self) -> Self:
-        """The same solids, of which other pairs may be selected."""
-        return copy.copy(self)
-
-    def select(self, pairs: Indices) -> None:
-        """Let ``pairs`` of shape (P, 2) be those that count."""
+        #: Of the solids that count (P, 2).
         self.pairs = pairs
-        both = np.concatenate((pairs, pairs[:, ::-1]))
-        self._spheres, self._boxes = both.T
 
     def place(
         self, joints: Tensor, objects: Mapping[str, tuple[Array, Array, Array]]
@@ -143,22 +133,24 @@ class Geometry:
                 state = self._links.state(joints.cpu().double()[:, self._columns])
                 turns[:, :links] = quaternions.to_matrix(state.orientations).numpy()
             origins[:, :links] = state.positions.numpy()
-            jacobians[:, :links, :, self._columns] = state.jacobians.numpy()
+            jacobians[:, :links][..., self._columns] = state.jacobians.numpy()
         for at, name in enumerate(self.objects, links):
             origins[:, at], turns[:, at], jacobians[:, at] = objects[name]
         turn = turns[:, self.carrier]
         centres = origins[:, self.carrier] + (turn @ self._centres[..., None])[..., 0]
         return Placed(centres, turn @ self._turns, origins, jacobians)
 
-    def least(self, placed: Placed) -> Array:
-        """Distances (B, P) that pairs have at least."""
-        balls, boxes, centres = self._spheres, self._boxes, placed.centres
-        away = centres[:, balls] - centres[:, boxes]
-        local = (away[..., None, :] @ placed.rotations[:, boxes])[..., 0, :]
-        outside = np.maximum(np.abs(local - self._middle[boxes]) - self._half[boxes], 0.0)
-        far = np.sqrt(np.einsum("bpi,bpi->bp", outside, outside)) - self._sphere[balls]
-        one, other = np.split(far, 2, axis=1)
-        return np.maximum(one, other)
+    def least(self, placed: Placed, robots: Indices, pairs: Indices) -> Array:
+        """Distances (N,) that some pairs of robots have at least."""
+        first, second = self.pairs[pairs].T
+        found = np.full(len(pairs), -np.inf)
+        for ball, box in ((first, second), (second, first)):
+            away = placed.centres[robots, ball] - placed.centres[robots, box]
+            local = np.einsum("ni,nij->nj", away, placed.rotations[robots, box])
+            outside = np.maximum(np.abs(local - self._middle[box]) - self._half[box], 0.0)
+            far = np.sqrt((outside**2).sum(1)) - self._radius[ball]
+            found = np.maximum(found, far)
+        return found
 
     def near(self, placed: Placed, within: Array) -> Near:
         """The pairs that are nearer than asked.
@@ -170,18 +162,22 @@ class Geometry:
             How near counts [m].
         """
         measure, model, data = mujoco_module().mj_geomDistance, self._model, self._data
-        robots, pairs = np.nonzero(self.least(placed) < within)
-        ways, before = np.zeros((len(robots), 6)), -1
+        first, second = self.pairs.T
+        away = placed.centres[:, first] - placed.centres[:, second]
+        reach = np.maximum(within + self._radius[first] + self._radius[second], 0.0)
+        robots, pairs = np.nonzero((away**2).sum(-1) < reach**2)
+        keep = self.least(placed, robots, pairs) < within[robots, pairs]
+        robots, pairs = robots[keep], pairs[keep]
+        ways, before, bounds = np.zeros((len(robots), 6)), -1, within[robots, pairs]
         distance: Array = np.zeros(len(robots))
-        for row, (robot, pair) in enumerate(zip(robots.tolist(), pairs.tolist(), strict=True)):
+        every = (robots.tolist(), *self.pairs[pairs].T.tolist(), bounds.tolist())
+        for row, (robot, one, other, bound) in enumerate(zip(*every, strict=True)):
             if robot != before:
                 data.geom_xpos[:] = placed.centres[robot]
                 data.geom_xmat[:] = placed.rotations[robot].reshape(-1, 9)
                 before = robot
-            one, other = self.pairs[pair].tolist()
-            bound = float(within[robot, pair])
             distance[row] = measure(model, data, one, other, bound, ways[row])
-        keep = distance < within[robots, pairs]
+        keep = distance < bounds
         robots, pairs, distance = robots[keep], pairs[keep], distance[keep]
         points = ways[keep].reshape(-1, 2, 3)
         way = points[:, 1] - points[:, 0]
@@ -198,8 +194,9 @@ class Geometry:
         found: Array = np.zeros((len(near.robot), placed.jacobians.shape[-1]))
         for side, sign in ((0, -1.0), (1, 1.0)):
             at = near.robot, self.carrier[self.pairs[near.pair, side]]
-            arm = near.points[:, side] - placed.origins[at]
-            twist = np.concatenate((near.normal, np.cross(arm, near.normal)), axis=1)
+            arm, n = near.points[:, side] - placed.origins[at], near.normal
+            turn = arm[:, [1, 2, 0]] * n[:, [2, 0, 1]] - arm[:, [2, 0, 1]] * n[:, [1, 2, 0]]
+            twist = np.concatenate((n, turn), axis=1)
             found += sign * np.einsum("ni,nij->nj", twist, placed.jacobians[at])
         return found
 
@@ -219,22 +216,21 @@ class Geometry:
         return way[..., 0]
 
 
-def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[int]]:
+def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[int] | slice]:
     """The kinematics of links that carry solids, and the columns of its joints.
 
     Coordinates have units of their own: what they move stands where it is at 0.
     """
     if not links:
-        return None, []
+        return None, slice(0)
     config = robot.config()
     apart = set(config["coordinates"])
     joints = [name for name in config["joints"] if name not in apart]
     still = dict.fromkeys((n for n in robot.model.actuated if n in apart), 0.0)
     changed = {"links": [*links], "joints": joints, "coordinates": [], "tools": {}}
     changed |= {"locked": {**config["locked"], **still}, "dtype": "float64"}
-    return type(robot).from_config({**config, **changed}), [
-        config["joints"].index(name) for name in joints
-    ]
+    columns = [config["joints"].index(name) for name in joints] if apart else slice(None)
+    return type(robot).from_config({**config, **changed}), columns
 
 
 def _flat(shapes: Sequence[Shape]) -> Any:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -11,14 +13,13 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from tpgmm_torch import gaussians, quaternions
+from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.obstacles.distances import Geometry
 from tpgmm_torch.obstacles.shapes import Shape, compiled, excluded, solids, urdf_solids
-from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.robots.robot import Robot
@@ -34,11 +35,6 @@ CLEARANCE = 0.01
 #: Postures of which all have to show two links of a robot overlap for that to be how coarse its
 #: solids are.
 POSTURES = 50
-#: Motions that are drawn from a skill in place of its demonstrations: one in twenty of all that
-#: are likely comes nearer than the nearest of them.
-MOTIONS = 20
-#: Instants of a demonstration that are looked at [s].
-STEP = 0.05
 
 
 class Scene:
@@ -74,6 +70,10 @@ class Scene:
         Pairs that do not count, in alphabetical order, and why.
     closer : mapping of (str, str) to float
         Pairs that may come half as near as demonstrations bring them, which is this [m].
+    pairs : tuple of (str, str)
+        Names of the pairs of solids that count, (P,).
+    needed : ndarray of shape (P,)
+        Distances that they keep [m].
 
     Raises
     ------
@@ -135,24 +135,14 @@ class Scene:
         """Of links, objects and obstacles that have solids."""
         return tuple(dict.fromkeys(shape.name for shape in self.shapes))
 
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        """Names of the pairs of solids that count, (P,)."""
-        return self._pairs
-
     def label(self, pair: int) -> str:
         """The names of a pair in words: "l_forearm / table"."""
-        return " / ".join(self.links_first(self._pairs[pair]))
+        return " / ".join(self.links_first(self.pairs[pair]))
 
     def links_first(self, pair: Pair) -> Pair:
         """A pair of names, of which a link of the robot is the first."""
         one, other = sorted(pair, key=lambda name: name not in self.robot.model.links)
         return one, other
-
-    @property
-    def needed(self) -> Array:
-        """Distances (P,) that these keep [m]."""
-        return self._needed
 
     def objects(
         self, state: RobotState | None, frames: Mapping[str, Frame], batch: int
@@ -221,78 +211,76 @@ class Scene:
         near = self.geometry.near(placed, np.full(shape, within))
         found: dict[Pair, Array] = {}
         for robot, pair, distance in zip(near.robot, near.pair, near.distance, strict=True):
-            row = found.setdefault(self._pairs[pair], np.full(len(postures), within))
+            row = found.setdefault(self.pairs[pair], np.full(len(postures), within))
             row[robot] = min(row[robot], distance)
         return found
 
-    def allowing(
-        self, demonstrations: Iterable[Demonstration], surroundings: bool = False
-    ) -> Self:
+    def allowing(self, demonstrations: Iterable[Demonstration]) -> Self:
         """The scene with pairs allowed that come near each other in demonstrations.
 
-        Pairs that overlap there do not count any more; those that come nearer than the
-        clearance may come half as near as they did.
+        Pairs that overlap there do not count any more; others may come half as near as they
+        did, if that is less than the clearance.
 
         Parameters
         ----------
         demonstrations : iterable of Demonstration
-            With their frames and holds.
-        surroundings : bool, default=False
-            Whether the obstacles stood there too, so that pairs with them count.
+            With their frames and holds. What stands still in the scene did not stand there.
         """
-        fixed = {one.name for one in self.shapes if one.carrier is None}
         least: dict[Pair, float] = {}
         for one in demonstrations:
             chosen = one.reordered(self.robot.joint_names)
-            every = max(
-                1, round(STEP * (len(one.time) - 1) / float(one.time[-1] - one.time[0]))
-            )
             state, frames = held_objects(
                 self.robot.state(chosen.joints), one.time, one.frames, one.holds or ()
             )
-            frames = {name: f.expand(one.time.shape)[::every] for name, f in frames.items()}
-            near = self.distances(
-                chosen.joints[::every], frames, self.clearance, state[::every]
-            )
+            near = self.distances(chosen.joints, frames, 2 * self.clearance, state)
             for pair, values in near.items():
                 least[pair] = min(least.get(pair, np.inf), float(values.min()))
-        if not surroundings:
-            least = {p: d for p, d in least.items() if fixed.isdisjoint(p)}
-        other = type(self).__new__(type(self))
-        other.__dict__ |= self.__dict__
-        other.closer = MappingProxyType(
-            {**self.closer, **{pair: d for pair, d in least.items() if d > 0}}
-        )
-        text = "overlap by {:.0f} mm in demonstrations"
-        other.geometry = self.geometry.copy()
-        other._allow({p: text.format(-1e3 * d) for p, d in least.items() if d <= 0})
-        return other
+        return self._near_each_other(least)
 
     def allowing_skill(self, skill: Any) -> Self:
-        """The scene with pairs of links allowed that come near each other in a skill.
+        """The scene with links allowed that come near each other in a skill's demonstrations.
 
-        For a saved skill, whose demonstrations are not at hand: motions are drawn from its
-        operators of all joints, :class:`~tpgmm_torch.Canonical`. Without such an operator the
-        scene stays as it is.
+        For a saved skill, whose demonstrations are not at hand: it keeps some postures of them.
 
         Parameters
         ----------
         skill : Skill
+
+        Warns
+        -----
+        PlausibilityWarning
+            If it keeps none, as files that an earlier release wrote.
         """
-        shown = []
-        away = {name: Frame([1e3] * 3) for name in self.geometry.objects}
-        for one in _mixtures(skill):
-            for index, operator in enumerate(one.operators):
-                if isinstance(operator, Canonical) and operator.joints is None:
-                    local, time = one.conditionals[index], one.time
-                    mean, covariance = gaussians.moment_match(
-                        one.weights_at(time), local.at(time), local.covariance
-                    )
-                    factor = gaussians.cholesky(covariance, "the joints")
-                    draws = torch.randn(MOTIONS, mean.shape[1], generator=_seeded()).to(mean)
-                    for way in mean + (factor @ draws.mT).movedim(-1, 0):
-                        shown.append(Demonstration(time, way, away, one.kinematics.joint_names))
-        return self.allowing(shown)
+        kept = [one.postures for one in _summaries(skill) if one is not None]
+        if not any(kept):
+            warnings.warn(
+                "the skill keeps no postures of its demonstrations, so that no links may come "
+                "near each other: fit it again, or use Scene.allowing(demonstrations)",
+                PlausibilityWarning,
+                stacklevel=2,
+            )
+            return self
+        postures = np.concatenate([one for one in kept if one])
+        near = self.distances(postures, self._away, 2 * self.clearance)
+        return self._near_each_other({pair: float(d.min()) for pair, d in near.items()})
+
+    def _near_each_other(self, least: Mapping[Pair, float]) -> Self:
+        """The scene with pairs allowed that were shown as near as that."""
+        fixed = {one.name for one in self.shapes if one.carrier is None}
+        least = {pair: d for pair, d in least.items() if fixed.isdisjoint(pair)}
+        other = copy.copy(self)
+        other.closer = MappingProxyType(
+            {**self.closer, **{pair: d for pair, d in least.items() if d > 0}}
+        )
+        text = "overlap by {:.0f} mm in demonstrations"
+        other.geometry = copy.copy(self.geometry)
+        other._allow({p: text.format(-1e3 * d) for p, d in least.items() if d <= 0})
+        return other
+
+    @property
+    def _away(self) -> dict[str, Frame]:
+        """Objects where they are near nothing."""
+        return {name: Frame([1e3] * 3) for name in self.geometry.objects}
 
     def _known(self, names: Sequence[str]) -> Pair:
         """A pair of solids that exist."""
@@ -308,20 +296,19 @@ class Scene:
             _pair([self.shapes[i].name for i in both]) for both in self.geometry.pairs.tolist()
         ]
         keep = [name not in self.allowed for name in names]
-        self.geometry.select(self.geometry.pairs[np.array(keep, bool)])
-        self._pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
-        self._needed = np.array(
-            [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self._pairs]
+        self.geometry.pairs = self.geometry.pairs[np.array(keep, bool)]
+        self.pairs = tuple(name for name, kept in zip(names, keep, strict=True) if kept)
+        self.needed = np.array(
+            [self.closer.get(pair, 2 * self.clearance) / 2 for pair in self.pairs]
         )
 
     def _always(self) -> dict[Pair, str]:
         """Links that overlap in all postures."""
         self._allow({})
         robot, links = self.robot, set(self.robot.model.links)
-        draw = torch.rand(POSTURES, robot.n_joints, generator=_seeded())
+        draw = torch.rand(POSTURES, robot.n_joints, generator=torch.Generator().manual_seed(0))
         low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
-        far = {name: Frame(np.full(3, 1e3)) for name in self.geometry.objects}
-        near = self.distances(torch.lerp(low, high, draw.to(low)), far, 1e-3)
+        near = self.distances(torch.lerp(low, high, draw.to(low)), self._away, 1e-3)
         return {
             pair: f"always overlap, by {-1e3 * float(values.max()):.0f} mm at least"
             for pair, values in near.items()
@@ -329,17 +316,13 @@ class Scene:
         }
 
 
-def _seeded() -> torch.Generator:
-    """Random numbers that are the same each time."""
-    return torch.Generator().manual_seed(0)
-
-
-def _mixtures(skill: Any) -> Iterator[Any]:
-    """The fitted mixtures that a skill is made of."""
-    if hasattr(skill, "operators"):
-        yield skill
-    for one in (*getattr(skill, "skills", ()), *filter(None, [getattr(skill, "skill", None)])):
-        yield from _mixtures(one)
+def _summaries(skill: Any) -> Iterator[Any]:
+    """Of the demonstrations of the skills that a skill is made of."""
+    parts = (*getattr(skill, "skills", ()), *filter(None, [getattr(skill, "skill", None)]))
+    for one in parts:
+        yield from _summaries(one)
+    if not parts:
+        yield skill.summary
 
 
 def _pair(names: Sequence[str]) -> Pair:

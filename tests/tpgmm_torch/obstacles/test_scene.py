@@ -1,20 +1,27 @@
 """Scenes: pairs that count, distances and their derivatives, the report of what touches."""
 
 import importlib
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 
-from tests.support.skills import small_bottle
+from tests.support.skills import few_bottles, small_bottle
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import Frame, Hold, Robot
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch import Frame, Hold, Robot, Sequence, ViaPoints, save
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    PlausibilityWarning,
+    UnknownNameError,
+)
 from tpgmm_torch.obstacles import Scene, Shape, find_contacts
 from tpgmm_torch.obstacles.distances import Geometry
+from tpgmm_torch.persistence import load_skill
 
 LINKS = ("l_hand", "r_hand")
 #: A table, a ball, a post and a free cup, as MuJoCo reads them.
@@ -114,7 +121,7 @@ def test_bounds_never_exceed_distances(scene):
     joints = postures(scene.robot, 20, seed=2)
     placed = scene.geometry.place(joints, scene.objects(None, {}, 20))
     near = scene.geometry.near(placed, np.full((20, len(scene.pairs)), 2.0))
-    least = scene.geometry.least(placed)[near.robot, near.pair]
+    least = scene.geometry.least(placed, near.robot, near.pair)
     assert (least <= np.maximum(near.distance, 0.0) + 1e-9).all()
     assert np.mean(least > 0.05) > 0.5  # most need no distance at all
 
@@ -151,7 +158,6 @@ def test_pairs_that_demonstrations_bring_near_are_allowed_by_name():
     assert ("bottle", "l_hand") in scene.pairs  # the first is as it was
     named = [pair for pair in allowing.allowed if "table" in pair]
     assert named == []  # nobody said that it stood there
-    assert ("l_hand", "table") in scene.allowing(shown, surroundings=True).allowed
     frames = shown[0].frames
     touched = {
         (one.one, one.other)
@@ -160,14 +166,24 @@ def test_pairs_that_demonstrations_bring_near_are_allowed_by_name():
     assert ("r_hand", "table") in touched and ("l_hand", "bottle") not in touched
 
 
-def test_a_saved_skill_allows_links_that_it_brings_near():
-    skill = small_bottle().skill
-    scene = Scene(skill.kinematics, [Shape.table(-1.0)], visuals=True).allowing_skill(skill)
-    way = skill.expected(1, skill.time)
-    assert {*scene.distances(way, within=0.01)} <= {*scene.closer}  # and may be as near
-    assert not {pair for pair in {*scene.allowed, *scene.closer} if "table" in pair}
-    alone = Scene(skill.kinematics, [Shape.table(-1.0)], visuals=True)
-    assert {*alone.distances(way, within=0.0)} <= {*scene.allowed}
+def test_a_saved_skill_allows_the_links_that_its_demonstrations_bring_near(tmp_path):
+    save(small_bottle(), tmp_path / "model")
+    skill = load_skill(tmp_path / "model")
+    ball = Shape.sphere(
+        "ball", 0.1, skill.kinematics.state(few_bottles()[0].joints[20]).positions[0]
+    )
+    scene = Scene(skill.kinematics, [ball], visuals=True)
+    kept, shown = scene.allowing_skill(skill), scene.allowing(few_bottles())
+    assert kept.allowed.keys() == shown.allowed.keys()
+    assert len(shown.closer) > 3
+    for pair, distance in shown.closer.items():  # half of what is known has to be kept
+        assert distance <= kept.closer.get(pair, 0.02) < 2 * distance
+    assert not [pair for pair in {*kept.closer, *kept.allowed} if "ball" in pair]
+    both = ViaPoints(skill, []), Sequence([skill, skill])
+    assert all(scene.allowing_skill(one).closer == kept.closer for one in both)
+    older = replace(skill, summary=replace(skill.summary, postures=()))
+    with pytest.warns(PlausibilityWarning, match="keeps no postures"):
+        assert scene.allowing_skill(older) is scene
 
 
 def test_the_robot_may_stand_in_the_file_and_excludes_allow_pairs():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
+    from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
     "Alignments", "DataOptions", "RobotOptions", "align", "command", "look",
@@ -347,7 +348,7 @@ def look(
     meshes: Path | None,
     obstacles: Path | None,
     visuals: bool,
-    kinematics: Kinematics,
+    skill: Skill,
     shown: list[Demonstration],
 ) -> dict[str, Any]:
     """Shapes of objects, the folder of meshes, and obstacles, as a view draws them."""
@@ -358,20 +359,18 @@ def look(
         raise DataError(f"--meshes needs a folder, got {str(meshes)!r}")
     pairs = [text.partition("=") for text in objects or ()]
     drawn = {name: parse_shape(shape) for name, _, shape in pairs}
-    around = obstacles and scene(obstacles, kinematics, visuals, shown)
+    around = obstacles and scene(obstacles, skill, visuals, shown)
     return {"objects": drawn, "meshes": meshes, "obstacles": around}
 
 
-def scene(
-    file: Path, kinematics: Kinematics, visuals: bool, shown: list[Demonstration]
-) -> Scene:
+def scene(file: Path, skill: Skill, visuals: bool, shown: list[Demonstration]) -> Scene:
     """The robot among the obstacles of a ``file``; what is allowed is listed."""
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.obstacles import Scene
 
     if not file.is_file():
         raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
-    scene = Scene(kinematics, file, visuals=visuals).allowing(shown)
+    scene = Scene(skill.kinematics, file, visuals=visuals).allowing(shown).allowing_skill(skill)
     for (one, other), reason in scene.allowed.items():
         typer.echo(f"allowed: {one} and {other} ({reason})")
     return scene

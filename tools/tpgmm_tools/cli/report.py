@@ -77,7 +77,7 @@ def report(
         raise DataError(
             f"there are {len(shown)} episodes, counted from 0: --situation {situation}"
         )
-    how = options.look(object_, meshes, obstacles, visuals, robot, shown)
+    how = options.look(object_, meshes, obstacles, visuals, fitted.skill, shown)
     place = out or Path(f"{model}.html")
     how |= {"situation": situation, "most": most, "title": model.resolve().name}
     console = Console(stderr=True)

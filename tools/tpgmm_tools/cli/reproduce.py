@@ -114,7 +114,7 @@ def reproduce(
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
     if obstacles is not None:
-        scene = options.scene(obstacles, kinematics, visuals, shown)
+        scene = options.scene(obstacles, skill, visuals, shown)
         pairs = zip(trajectories, wanted, strict=True)
         if _touches(scene, [(t, s.frames_at(t.time.cpu())) for t, s in pairs], skill.holds):
             raise typer.Exit(COLLIDES)

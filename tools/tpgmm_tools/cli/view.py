@@ -107,8 +107,7 @@ def view(
         raise DataError(
             f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
         )
-    robot = fitted.kinematics_
-    how = options.look(object_, meshes, obstacles, visuals, robot, demonstrations)
+    how = options.look(object_, meshes, obstacles, visuals, fitted.skill, demonstrations)
     how["fps"] = fps
     if live:
         at = {"host": host, "port": port, "first": situation, **how}
