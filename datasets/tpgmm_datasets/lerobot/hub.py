@@ -46,8 +46,7 @@ def local_folder(path: str | Path) -> Path:
     recover(folder)
     if folder.is_dir():
         return folder
-    hint = ", but a file: read_table and save_lerobot make a data set of a table"
-    hint *= folder.is_file()
+    hint = ", but a file: save_lerobot makes a set of what read_table reads" * folder.is_file()
     if isinstance(path, str) and re.fullmatch(REPO_ID, path):
         home = os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")
         recorded = Path(os.environ.get("HF_LEROBOT_HOME", Path(home) / "lerobot")) / path

@@ -79,7 +79,9 @@ def report(
         )
     how = options.look(object_, meshes, obstacles, visuals, fitted.skill, shown)
     place = out or Path(f"{model}.html")
-    how |= {"situation": situation, "most": most, "title": model.resolve().name}
+    folder = model.resolve()
+    title = folder.parent.name if folder.name == "model" else folder.name
+    how |= {"situation": situation, "most": most, "title": title}
     console = Console(stderr=True)
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("leaving one out")
