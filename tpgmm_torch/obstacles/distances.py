@@ -26,8 +26,8 @@ __all__ = ["Geometry", "Near", "Placed"]
 
 Indices = NDArray[np.intp]
 
-#: Versions of MuJoCo, from and up to, in which meshes that are apart may have the distance 0.
-WRONG_MESHES = (3, 8), (3, 12)
+#: First version of MuJoCo whose distances agree with what touches, for all kinds of solids.
+RIGHT_DISTANCES = (3, 12)
 #: Of a plane, which has no middle, where a radius is asked for [m].
 ENDLESS = 1e9
 #: A way between two solids that is shorter has no direction [m].
@@ -86,7 +86,7 @@ class Geometry:
     Raises
     ------
     DependencyError
-        Without MuJoCo, or with one whose distances of meshes are wrong.
+        Without MuJoCo 3.12 or newer; distances of older ones are wrong.
     """
 
     def __init__(self, robot: Robot, shapes: Sequence[Shape], pairs: Indices) -> None:
@@ -236,18 +236,15 @@ def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[in
 def _flat(shapes: Sequence[Shape]) -> Any:
     """A MuJoCo model with the solids side by side, each posed as in its carrier."""
     mujoco = mujoco_module()
-    version = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
+    if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) < RIGHT_DISTANCES:
+        raise DependencyError(
+            f"MuJoCo {mujoco.__version__} returns wrong distances: pip install 'mujoco>=3.12'"
+        )
     spec = mujoco.MjSpec()
     for index, shape in enumerate(shapes):
         geom: dict[str, Any] = {"type": getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}")}
         size = [*shape.size, 0.0, 0.0, 0.0][:3]
         if shape.vertices is not None:
-            if WRONG_MESHES[0] <= version < WRONG_MESHES[1]:
-                raise DependencyError(
-                    f"MuJoCo {mujoco.__version__} gives meshes that are apart the distance 0 "
-                    f"({shape.name!r} has one): pip install 'mujoco>=3.12', or use boxes, "
-                    "spheres, capsules and cylinders"
-                )
             mesh = spec.add_mesh(name=f"mesh{index}", uservert=shape.vertices.ravel().tolist())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             geom["meshname"], size = mesh.name, [0.0, 0.0, 0.0]

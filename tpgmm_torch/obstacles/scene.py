@@ -80,8 +80,8 @@ class Scene:
     DataError, UnknownNameError
         If there is no geometry, or a pair names what does not exist.
     DependencyError
-        Without MuJoCo, of the extra ``simulation``; with meshes also of MuJoCo 3.8 to 3.11,
-        whose distances of meshes are wrong.
+        Without MuJoCo 3.12 or newer, of the extra ``simulation``; distances of older ones are
+        wrong.
 
     Examples
     --------

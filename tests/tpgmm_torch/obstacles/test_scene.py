@@ -215,9 +215,7 @@ def test_lying_solids_reach_from_end_to_end(inside):
         assert found == pytest.approx([np.hypot(0.1, 0.05) - 0.05])
 
 
-def test_meshes_are_read_from_their_folder_and_refused_where_mujoco_is_wrong(
-    tmp_path, monkeypatch
-):
+def test_meshes_are_read_from_their_folder(tmp_path):
     (tmp_path / "hand.obj").write_text(
         "".join(f"v {p}\n" for p in TETRAHEDRON.split("  "))
         + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -228,10 +226,12 @@ def test_meshes_are_read_from_their_folder_and_refused_where_mujoco_is_wrong(
     ball = Shape.sphere("ball", 0.05, [0.5, 0.0, 0.0])
     scene = Scene(robot, [ball], meshes=tmp_path)
     assert scene.distances([[0.0]])["ball", "hand"] == pytest.approx([0.15])
-    monkeypatch.setattr(mujoco, "__version__", "3.9.0")
-    with pytest.raises(DependencyError, match=r"MuJoCo 3.9.0 .*'hand' has one.*>=3.12"):
-        Scene(robot, [ball], meshes=tmp_path)
-    assert Scene(of_one_arm(), [ball]).pairs  # others are right there too
+
+
+def test_versions_of_mujoco_with_wrong_distances_are_refused(monkeypatch):
+    monkeypatch.setattr(mujoco, "__version__", "3.11.0")
+    with pytest.raises(DependencyError, match=r"MuJoCo 3.11.0 .*>=3.12"):
+        Scene(of_one_arm(), [Shape.table(-0.1)])
 
 
 def test_what_cannot_be_is_an_error():
