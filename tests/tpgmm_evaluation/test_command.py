@@ -11,7 +11,7 @@ from tpgmm_evaluation.compare import Comparison
 
 
 def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
-    text = output("compare", "--help")
+    text = output("compare", "--help-all")
     for word in ("--budget", "--conditions", "everything", "lerobot-eval", "-phase"):
         assert word in " ".join(text.split())
     out = ("--out", tmp_path / "out")

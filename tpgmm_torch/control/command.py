@@ -249,11 +249,7 @@ def statuses(
     obstructed : mapping of int to (bool, str)
         Robots that obstacles keep off: whether time waits for them, and why.
     """
-    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
-    if gates is not None and gates.reasons:
-        texts |= gates.reasons
-        codes[list(texts)] = Status.WAITING.code
-        codes[gates.failed] = Status.HOLDING.code
+    codes, texts = _at_gates(progress, gates)
     if progress.waits.any():
         texts |= _waiting(progress, names, wanted, inputs)
         codes[progress.waits] = Status.WAITING.code
@@ -272,6 +268,18 @@ def statuses(
         codes[halted] = Status.HOLDING.code
         reasons |= inputs.reasons(halted.reshape(tuple(batch)))
     return codes, reasons or _NO_REASONS
+
+
+def _at_gates(
+    progress: Progress, gates: Gates | None
+) -> tuple[NDArray[np.int8], dict[int, str]]:
+    """The status of robots whose skill has to be followed by another, and why they stand."""
+    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    if gates is not None and gates.reasons:
+        texts |= gates.reasons
+        codes[list(texts)] = Status.WAITING.code
+        codes[gates.failed] = Status.HOLDING.code
+    return codes, texts
 
 
 def _waiting(

@@ -225,10 +225,8 @@ class Controller:
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
         self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
-        forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
-        contacts = {operator.link: operator.contact for operator in forces}
-        self._wrenches = Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), contacts)
-        self._needs_wrench = admittance is not None and bool(forces)
+        self._wrenches = _expected_contacts(skill, start, begin)
+        forces = self._wrenches.thresholds
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
@@ -424,7 +422,7 @@ class Controller:
 
     def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
         """Measured wrenches; ages of inputs, with those that are missing too long."""
-        if tick.first and self._trusts and self._needs_wrench and not wrenches:
+        if tick.first and self._trusts and self._offsets and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
         self._wrenches = self._wrenches.update(tick.seconds, wrenches)
         if self._inputs is None:
@@ -766,6 +764,13 @@ def _rows(array: Array) -> Array:
 
 def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
+
+
+def _expected_contacts(skill: Skill, start: Tensor, begin: float) -> Wrenches:
+    """The wrenches of robots, with the thresholds of the skill's own contacts."""
+    forces = [one.operator for one in skill.expected_forces(start.new_tensor(begin))]
+    contacts = {operator.link: operator.contact for operator in forces}
+    return Wrenches(skill.kinematics.links, tuple(start.shape[:-1]), contacts)
 
 
 def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:

@@ -81,15 +81,19 @@ def _term(term: str, text: str) -> list[Operator]:
     if kind is None:
         joints = tuple(match["joints"].split(",")) if match["joints"] else None
         return [Canonical(joints=joints, **options)]
-    if kind.startswith("pose") and options:
-        raise DataError(
-            f"operator {text!r}: {term!r} is a position [m] and an orientation [rad], of "
-            "which each has a tolerance of its own: write both"
-        )
     if kind.startswith("wrench"):
         axes = None if match["axes"] is None else tuple(map("xyz".index, match["axes"]))
         return [Wrench(match["link"], frame, axes, **options)]
-    place: list[str] = [match["link"]]
+    return _poses(match, options, text)
+
+
+def _poses(match: re.Match[str], options: dict[str, Any], text: str) -> list[Operator]:
+    if match["kind"].startswith("pose") and options:
+        raise DataError(
+            f"operator {text!r}: {match[0]!r} is a position [m] and an orientation [rad], of "
+            "which each has a tolerance of its own: write both"
+        )
+    place, frame = [match["link"]], match["frame"]
     position: Any = AbsolutePosition
     orientation: Any = AbsoluteOrientation
     if frame:
@@ -97,7 +101,8 @@ def _term(term: str, text: str) -> list[Operator]:
         place, options["held"] = [*place, frame], bool(match["held"])
     geometry = match["geometry"] or "quaternion"
     one, other = position(*place, **options), orientation(*place, **options, geometry=geometry)
-    return {"position": [one], "orientation": [other], "pose": [one, other]}[kind.split("[")[0]]
+    kind = match["kind"].split("[")[0]
+    return {"position": [one], "orientation": [other], "pose": [one, other]}[kind]
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
@@ -128,17 +133,25 @@ def format_operator(operator: Operator) -> str:
         terms = " + ".join(map(format_operator, operator.operators))
         return PAIR.sub(r"pose\2:\1", terms)
     one: Any = operator
-    if type(operator) is Canonical:
-        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
-    elif type(operator) is Wrench:
-        axes = "" if one.axes is None else f"[{''.join('xyz'[axis] for axis in one.axes)}]"
-        text = f"wrench{axes}:{one.link}@{one.frame}"
-    elif type(operator) in POSE_OPERATORS:
-        kind = "position" if one.gain is None else "orientation"
-        tangent = "[tangent]" if operator.rotation_vector_starts(None) else ""
-        text = f"{kind}{tangent}:{one.link}"
-        if hasattr(operator, "frame"):
-            text += f"@{'held:' if one.held else ''}{one.frame}"
-    else:
+    text = _bare(one)
+    if text is None:
         return repr(operator)
     return text if one.tolerance == type(one).tolerance else f"{text}~{one.tolerance!r}"
+
+
+def _bare(one: Any) -> str | None:
+    """Text of an operator without its tolerance; None if there is no such text."""
+    if type(one) is Canonical:
+        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
+    elif type(one) is Wrench:
+        axes = f"[{''.join(map('xyz'.__getitem__, one.axes))}]" if one.axes else ""
+        text = f"wrench{axes}:{one.link}@{one.frame}"
+    elif type(one) in POSE_OPERATORS:
+        kind = "position" if one.gain is None else "orientation"
+        tangent = "[tangent]" if one.rotation_vector_starts(None) else ""
+        text = f"{kind}{tangent}:{one.link}"
+        if hasattr(one, "frame"):
+            text += f"@{'held:' if one.held else ''}{one.frame}"
+    else:
+        text = None
+    return text

@@ -80,12 +80,7 @@ class Sequence(CompositeSkill):
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        skills, count = tuple(self.skills), len(self.skills)
-        names = tuple(self.names) or tuple(map(str, range(count)))
-        if not count or not 0 < self.timeout < math.inf or not 0 <= self.fade < math.inf:
-            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
-        if len(set(names)) < count or len(names) > count:
-            raise DataError(f"{count} skills need a name each, got {list(names)}")
+        skills, count, names = tuple(self.skills), len(self.skills), self._checked_names()
         parts = _are_parts(skills, self.fade or PARTS_FADE)
         untils = _of_each("until", self.until or None, count)
         retries = _of_each("retry", self.retry or 0, count)
@@ -97,6 +92,16 @@ class Sequence(CompositeSkill):
             "retry": tuple(_retry(names, *each) for each in enumerate(retries)),
         }.items():
             object.__setattr__(self, name, value)
+
+    def _checked_names(self) -> tuple[str, ...]:
+        """Names of the skills, of which there is at least one; all settings are numbers."""
+        count = len(self.skills)
+        if not count or not 0 < self.timeout < math.inf or not 0 <= self.fade < math.inf:
+            raise DataError(f"a sequence has skills, a positive fade and timeout, got {self!r}")
+        names = tuple(self.names) or tuple(map(str, range(count)))
+        if len(set(names)) < count or len(names) > count:
+            raise DataError(f"{count} skills need a name each, got {list(names)}")
+        return names
 
     @classmethod
     def parse(

@@ -46,7 +46,7 @@ def test_experts_insert_the_peg(motions, env):
 
 def test_the_peg_is_seen_from_the_block_as_it_is_carried():
     *_, together, _ = map(format_operator, TASK.operators())
-    assert together == "position:peg@held:block + orientation:peg@held:block"
+    assert together == "pose:peg@held:block"
 
 
 def test_half_the_way_is_not_deep_enough(motions, env):

@@ -47,7 +47,7 @@ def test_a_table_becomes_a_moving_picture_and_files(table, tmp_path):
     given = page.UPLOADED, [table], "upper_body", None, "l_hand, r_hand", "", 6
     skill, report = page.learn(*given)
     assert report.startswith("Learned 2 demonstrations")
-    assert "- `position:l_hand@bottle + " in report and "- `canonical`" in report
+    assert "- `pose:l_hand@bottle + " in report and "- `canonical`" in report
     [place] = page.places_of(skill, 2)
     situation = skill.situation(2)
     expected = situation.frames["bottle"].position.tolist()

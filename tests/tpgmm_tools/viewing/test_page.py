@@ -64,7 +64,7 @@ def test_links_and_objects_are_where_the_reproduction_has_them(motion):
 
 def test_without_viser_the_error_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[view\]"):
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[cli\]"):
         write_motion(tmp_path / "m.html", skills.hands(), skills.new_handling()[0])
 
 

@@ -12,7 +12,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
     "text",
     [
         "3.2:position:l_hand@bottle=0.0,0.0,0.1",
-        "1.5:position:l_hand + orientation:l_hand=0.3,0.1,0.2,1.0,0.0,0.0,0.0~0.01",
+        "1.5:pose:l_hand=0.3,0.1,0.2,1.0,0.0,0.0,0.0~0.01",
         "0.25:canonical=l_elbow:0.4,r_elbow:-0.1~0.001",
         "2.0:position:r_hand=0.3,0.1,0.2~1.0,1.0,0.0001",
     ],

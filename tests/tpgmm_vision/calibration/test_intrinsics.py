@@ -34,7 +34,7 @@ def test_what_is_missing_is_said(eye, pictures):
     rng, some = np.random.default_rng(0), dict(list(pictures.items())[:7])
     blank = {f"blank {k}.png": np.full((480, 640), 90, np.uint8) for k in range(3)}
     with pytest.raises(
-        DataError, match=r"7 of 10 .* there is none in \['blank 0.png', 'blank 1"
+        DataError, match=r"7 of 10 .* it is missing in \['blank 0.png', 'blank 1"
     ):
         calibrate_camera(some | blank, Board())
     with pytest.raises(DataError, match="one size"):
