@@ -16,6 +16,7 @@ from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
+from tpgmm_datasets.units import Scale
 from tpgmm_tools.arguments import options
 from tpgmm_tools.arguments.learning import (
     Choices,
@@ -179,6 +180,8 @@ def fit(
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
+    place = Path(out, "model") if Path(out, "model").is_dir() else out
+    typer.echo(f"next             tpgmm report {place} --dataset {dataset}")
 
 
 class Aligned:
@@ -222,7 +225,7 @@ def _recording_summary(
     units: dict[str, list[str]] = {}
     for name, unit in zip(joints.names or ("all",), joints.units, strict=False):
         if name in names or not names:
-            units.setdefault("rad or m" if unit == "auto" else str(unit), []).append(name)
+            units.setdefault(_unit(unit), []).append(name)
     lines["units"] = "; ".join(
         f"{unit}: {', '.join(of)}" if len(units) > 1 else unit for unit, of in units.items()
     )
@@ -240,10 +243,15 @@ def _recording_summary(
         str(replace(one, begin=round(one.begin, 2), end=round(one.end, 2)))
         for one in kept[0].holds or ()
     ]
-    hint = " (--operator auto, if it counts where that is put)"
     counts = bool(holds) and default and len(kept[0].frames) > 1
-    lines["held"] = ", ".join(holds) + hint * counts
+    lines["held"] = ", ".join(holds) + " (put onto an object: --operator auto)" * counts
     return {name: text or "none" for name, text in lines.items()}
+
+
+def _unit(unit: str | Scale) -> str:
+    """A unit in words, or as the numbers that turn a stored value into it."""
+    numbers = isinstance(unit, Scale) and f"{unit.factor:.4g} x value {unit.offset:+.4g}"
+    return f"{numbers} rad or m" if numbers else str(unit).replace("auto", "rad or m")
 
 
 def _echo(lines: dict[str, object]) -> None:
