@@ -60,8 +60,8 @@ metaworld: ## Try all tasks of Meta-World; ARGS="--tasks reach-v3 --demonstratio
 	$(MAKE) $(METAWORLD)/.installed-metaworld VENV=$(METAWORLD)
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(METAWORLD)/bin/python -m tpgmm_evaluation.metaworld $(ARGS)
 
-test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+test: $(VENV)/.installed-test ## Run the tests but slow ones; all, as CI: PYTEST_ARGS="-m ''"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow" $(PYTEST_ARGS)
 
 # Without mink, and without lerobot, whose oldest version `make test` takes (constraints.txt) and whose newest
 # `make newest`; and the oldest pyarrow cannot write one of the damaged files.

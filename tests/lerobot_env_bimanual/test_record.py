@@ -11,7 +11,8 @@ from tpgmm_datasets import load_lerobot
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_vision.cell import read_cell
 
-pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
+DRAWN = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
+pytestmark = [DRAWN, pytest.mark.slow]
 
 SMALL = ["--size", "160", "120", "--fps", "25"]
 

@@ -20,6 +20,8 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_vision import sources
 from tpgmm_vision.poses import inverse, pose_matrix, pose_vector, rigid
 
+pytestmark = pytest.mark.slow
+
 RATE = 25.0
 needs_pictures = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 LOST = np.full(7, np.nan)

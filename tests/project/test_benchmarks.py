@@ -14,6 +14,8 @@ from benchmarks.rows import Asked, Omitted, Row, markdown
 from benchmarks.settings import CASES, Settings
 from benchmarks.timing import in_turns, medians, per_iteration
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 

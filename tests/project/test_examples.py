@@ -10,6 +10,8 @@ import pytest
 
 from tests.support.robot_zoo import G1_PATH
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parents[2] / "examples"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("plot_*.py"))
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data"

@@ -19,6 +19,8 @@ from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import DataError
 
+pytestmark = pytest.mark.slow
+
 NAMES = [f"{name}.{part}" for name in ("bottle", "tray") for part in POSE_PARTS]
 KINEMATIC = {"mode": "kinematic"}
 DEMONSTRATIONS = 7

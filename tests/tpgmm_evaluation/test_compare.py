@@ -22,6 +22,8 @@ from tpgmm_evaluation.variants import OPEN_LOOP
 from tpgmm_torch import Canonical
 from tpgmm_torch.exceptions import UnknownNameError
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = Settings(
     options={"mode": "kinematic"},
     rate=20,

@@ -228,6 +228,7 @@ class Controller:
         self._wrenches = _expected_contacts(skill, start, begin)
         forces = self._wrenches.thresholds
         self._offsets = Offsets(admittance) if admittance is not None and forces else None
+        self._needs_wrench = self._offsets is not None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
         bounds = _motion_bounds(skill, bounds)
@@ -422,7 +423,7 @@ class Controller:
 
     def _touched(self, tick: _Tick, wrenches: Any, ages: Any) -> Any:
         """Measured wrenches; ages of inputs, with those that are missing too long."""
-        if tick.first and self._trusts and self._offsets and not wrenches:
+        if tick.first and self._trusts and self._needs_wrench and not wrenches:
             warnings.warn(NO_WRENCH, PlausibilityWarning, stacklevel=3)
         self._wrenches = self._wrenches.update(tick.seconds, wrenches)
         if self._inputs is None:

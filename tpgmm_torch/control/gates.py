@@ -42,7 +42,7 @@ class Moment:
     frames : mapping of str to Frame
         Where objects are seen, or were seen last.
     unseen : mapping of str to Tensor of bool of shape (...)
-        Which robots do not see an object of :attr:`frames` now; those that were given at the
+        Which robots do not see an object of ``frames`` now; those that were given at the
         start alone are seen by none.
     holding : Holding
         What the robots hold.

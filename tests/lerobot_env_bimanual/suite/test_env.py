@@ -26,6 +26,8 @@ from lerobot_env_bimanual.suite.tasks import suite_task
 from tests.support.suite_expert import TRIED, replay, start_of, tick
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
+pytestmark = pytest.mark.slow
+
 FPS = 25
 TASK = suite_task("handover")
 

@@ -17,6 +17,8 @@ from tpgmm_evaluation.regressions.sections import SECTIONS, measure
 from tpgmm_evaluation.regressions.sensitivity import sensitivity
 from tpgmm_torch.exceptions import DataError
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 #: Of the section that stands for all.
 VALUE = 3.0

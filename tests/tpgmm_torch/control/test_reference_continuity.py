@@ -7,6 +7,8 @@ from tpgmm_evaluation.faults.drawing import HALVES, Fault, Run
 from tpgmm_evaluation.faults.measures import measured
 from tpgmm_evaluation.faults.servos import Servo
 
+pytestmark = pytest.mark.slow
+
 ALL, ONE = np.ones(4), np.eye(4)[1]
 BOUNDS = ("position", "speed", "acceleration", "jerk", "infinite", "raised")
 

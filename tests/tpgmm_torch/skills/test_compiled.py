@@ -27,6 +27,8 @@ from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.compiled import PART, compile_skill, export_estimate
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "deployment_cpp"
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
 URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="lower"/>

@@ -19,6 +19,8 @@ from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_evaluation.benchmarks import benchmark
 from tpgmm_torch import quaternions
 
+pytestmark = pytest.mark.slow
+
 FPS = 25
 #: Robots that others describe.
 OTHERS = [name for name in TRIED if name != UPPER_BODY]
