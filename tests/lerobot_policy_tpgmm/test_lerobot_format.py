@@ -35,7 +35,9 @@ def directory(tmp_path_factory):
     shaking = replace(generator(), steady_rhythm=True)
     save_lerobot(shaking.demonstrations(10, seed=0), folder / "set", fps=20, task="shake")
     printed = output("fit", folder / "set", *BOTTLE, "--out", folder / "policy")
-    assert printed.endswith(f"{folder / 'policy'}\n")
+    saved, following = printed.splitlines()[-2:]
+    assert saved.endswith(f" {folder / 'policy'}")
+    assert f"tpgmm report {folder / 'policy' / 'model'} --dataset" in following
     return folder / "policy"
 
 
