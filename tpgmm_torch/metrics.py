@@ -29,6 +29,7 @@ __all__ = [
     "PoseScorer",
     "joint_rmse",
     "largest_acceleration",
+    "largest_speeds",
     "largest_velocity",
     "pose_errors",
     "reproduction_scorer",
@@ -283,8 +284,18 @@ def largest_velocity(motion: Trajectory | Demonstration) -> float:
     >>> largest_velocity(Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [1.5]]))
     2.0
     """
-    speed = motion.joints.diff(dim=0) / motion.time.diff()[:, None]
-    return float(speed.abs().max())
+    return float(largest_speeds(motion).max())
+
+
+def largest_speeds(motion: Trajectory | Demonstration) -> Tensor:
+    """Largest speed of each joint of a ``motion``, (n_joints,), by first differences [rad/s].
+
+    Examples
+    --------
+    >>> largest_speeds(Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [1.5]])).tolist()
+    [2.0]
+    """
+    return (motion.joints.diff(dim=0) / motion.time.diff()[:, None]).abs().amax(0)
 
 
 def largest_acceleration(motion: Trajectory | Demonstration) -> float:

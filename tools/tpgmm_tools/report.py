@@ -28,7 +28,7 @@ from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.metrics import joint_rmse, pose_errors
+from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
 from tpgmm_torch.obstacles import Scene, find_contacts
 from tpgmm_torch.operators.base import of_joints
 
@@ -270,15 +270,8 @@ def _joints(
 ) -> tuple[str, list[str]]:
     """Ranges and speeds of the joints, and sentences about those near their limits."""
     robot, rows, near = model.kinematics_, [], []
-    joints = [as_array(one.joints) for one in motions]
-    every = np.concatenate(joints)
-    fastest = np.max(
-        [
-            np.abs(np.gradient(one, as_array(motion.time), axis=0)).max(0)
-            for one, motion in zip(joints, motions, strict=True)
-        ],
-        axis=0,
-    )
+    every = np.concatenate([as_array(one.joints) for one in motions])
+    fastest = np.max([as_array(largest_speeds(one)) for one in motions], axis=0)
     low, high, limit = map(as_array, (robot.lower, robot.upper, robot.velocity))
     for j, name in enumerate(robot.joint_names):
         unit, least, most = _unit(model, j), every[:, j].min(), every[:, j].max()

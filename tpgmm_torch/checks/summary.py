@@ -187,8 +187,8 @@ class TrainingSummary:
     events : mapping of str to float
         Median times of events that all demonstrations have, as shares of the duration.
     postures : sequence of sequence of float
-        Some of all demonstrations (P, n_joints), to find links that come near each other; none
-        in files of before they were kept [rad or m].
+        Some of all demonstrations (P, n_joints), to find links that come near each other; empty
+        in files that an earlier release wrote [rad or m].
     """
 
     n_demonstrations: int

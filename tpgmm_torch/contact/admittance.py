@@ -78,7 +78,7 @@ class Offsets:
         self,
         expected: Sequence[ExpectedForce],
         wrenches: Wrenches,
-        state: RobotState,
+        state: RobotState | None,
         frames: Mapping[str, Frame],
         dt: Tensor,
     ) -> Self:
@@ -90,8 +90,8 @@ class Offsets:
             Of this tick. Operators that are no longer among them are given up.
         wrenches : Wrenches
             Robots without a fresh one keep their offsets.
-        state : RobotState
-            Of the robots, without offsets.
+        state : RobotState or None
+            Of the robots, without offsets, where axes are those of links.
         frames : mapping of str to Frame
         dt : Tensor of shape (...)
             Since the last tick [s]; 0 for robots that are held.

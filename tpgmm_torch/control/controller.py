@@ -552,13 +552,15 @@ class Controller:
         """How far links are moved by the errors of their forces."""
         if self._offsets is None or not self._wrenches.readings:
             return
-        state = self._skill.kinematics.state(self._postures(tick, measured=True))
+        expected, kinematics = self._skill.expected_forces(tick.time), self._skill.kinematics
+        operators, state = (*(one.operator for one in expected), *self._offsets.values), None
+        if any(operator.frame in kinematics.links for operator in operators):
+            state = kinematics.state(self._postures(tick, measured=True))
         passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
         passed = torch.where(self._tensor(self._stands(tick)), 0.0, passed)
         self._offsets = self._offsets.advance(
-            self._skill.expected_forces(tick.time), self._wrenches, state, self.holding.frames,
-            passed,
-        )  # fmt: skip
+            expected, self._wrenches, state, self.holding.frames, passed
+        )
 
     def _estimate(self, tick: _Tick) -> Estimate:
         """Estimate by the skill."""

@@ -225,9 +225,10 @@ class Gates:
         grips, no_robot = dict(self.grips), moment.no_robot
         for hold in (hold for gate in self.gates for _, hold in gate.holds):
             if hold.frame in moment.frames:
-                link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
-                grip = grips.get(hold) or Grip(link, thing, no_robot, no_robot)
-                grips[hold] = grip.update(hold, moment)
+                if hold not in grips:
+                    link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
+                    grips[hold] = Grip(link, thing, no_robot, no_robot)
+                grips[hold] = grips[hold].update(hold, moment)
         return grips
 
     def _decided(self, at: Flags, dt: Array, moment: Moment) -> Self:

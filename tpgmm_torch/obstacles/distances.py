@@ -19,7 +19,8 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.obstacles.shapes import Shape, mujoco_module
+from tpgmm_torch.obstacles.shapes import Shape
+from tpgmm_torch.robots.mjcf import mujoco_module
 from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["Geometry", "Near", "Placed"]
@@ -97,7 +98,7 @@ class Geometry:
         self.carrier = np.array([carriers.index(one.carrier) for one in shapes], np.intp)
         self._links, self._columns = _of_links(robot, links)
         self._model = _flat(shapes)
-        self._data = mujoco_module().MjData(self._model)
+        self._data = mujoco_module("distances").MjData(self._model)
         model = self._model
         self._centres = model.geom_pos.copy()
         turns = torch.from_numpy(model.geom_quat.copy())
@@ -161,7 +162,11 @@ class Geometry:
         within : ndarray of shape (B, P)
             How near counts [m].
         """
-        measure, model, data = mujoco_module().mj_geomDistance, self._model, self._data
+        measure, model, data = (
+            mujoco_module("distances").mj_geomDistance,
+            self._model,
+            self._data,
+        )
         first, second = self.pairs.T
         away = placed.centres[:, first] - placed.centres[:, second]
         reach = np.maximum(within + self._radius[first] + self._radius[second], 0.0)
@@ -235,7 +240,7 @@ def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[in
 
 def _flat(shapes: Sequence[Shape]) -> Any:
     """A MuJoCo model with the solids side by side, each posed as in its carrier."""
-    mujoco = mujoco_module()
+    mujoco = mujoco_module("distances")
     if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) < RIGHT_DISTANCES:
         raise DependencyError(
             f"MuJoCo {mujoco.__version__} returns wrong distances: pip install 'mujoco>=3.12'"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -14,11 +13,11 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, DependencyError
-from tpgmm_torch.robots.mjcf import HOW_TO_INSTALL
-from tpgmm_torch.robots.urdf import description_text, free_name, is_text, parse_xml
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.mjcf import compiled, mujoco_module
+from tpgmm_torch.robots.urdf import free_name, parse_xml
 
-__all__ = ["Shape", "compiled", "excluded", "mujoco_module", "solids", "urdf_solids"]
+__all__ = ["Shape", "excluded", "solids", "urdf_solids"]
 
 #: How many numbers say how large a solid is: half edges; radius; radius and half length.
 SIZES: Mapping[str, int] = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3}
@@ -152,26 +151,6 @@ def _placed(
     return pose, carrier
 
 
-def mujoco_module() -> Any:
-    """MuJoCo, or a DependencyError that says how to install it."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise DependencyError(f"distances need MuJoCo: {HOW_TO_INSTALL}") from error
-    return mujoco
-
-
-def compiled(description: str | os.PathLike[str]) -> Any:
-    """The compiled model of an MJCF, a ``description`` that is a path or the text itself."""
-    mujoco = mujoco_module()
-    try:
-        if is_text(description):
-            return mujoco.MjModel.from_xml_string(description_text(description).rstrip())
-        return mujoco.MjModel.from_xml_path(os.fspath(description))
-    except (ValueError, mujoco.FatalError) as error:
-        raise DataError(f"MuJoCo cannot compile the obstacles: {error}") from error
-
-
 def excluded(model: Any) -> list[tuple[str, str]]:
     """Names of the bodies whose contacts a compiled ``model`` excludes."""
     pairs = [divmod(int(both), 1 << 16) for both in model.exclude_signature]
@@ -192,7 +171,7 @@ def solids(model: Any, links: Sequence[str], base: str, visuals: bool) -> Iterat
     visuals : bool
         Whether solids count that collide with nothing.
     """
-    mujoco = mujoco_module()
+    mujoco = mujoco_module("distances")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     names = [model.body(i).name or free_name(f"body{i}", ()) for i in range(model.nbody)]
@@ -209,7 +188,7 @@ def _solid(
 ) -> Shape:
     """One of the solids of a compiled model, with the poses of its bodies in the base frame."""
     geom, body = model.geom(index), int(model.geom_bodyid[index])
-    kind = mujoco_module().mjtGeom(int(model.geom_type[index])).name
+    kind = mujoco_module("distances").mjtGeom(int(model.geom_type[index])).name
     kind = kind.removeprefix("mjGEOM_").lower()
     size = geom.size[: SIZES.get(kind, 3)].tolist()
     pose = Frame(geom.pos.copy(), geom.quat.copy())
@@ -274,7 +253,7 @@ def urdf_solids(text: str, meshes: Path | None, visuals: bool) -> list[Shape]:
             + (", only visuals: visuals=True takes these" if seen else "")
             + "; or give the file that has it, geometry='robot.xml'"
         )
-    model = compiled(ElementTree.tostring(flat, encoding="unicode"))
+    model = compiled(ElementTree.tostring(flat, encoding="unicode"), "the robot")
     return [replace(one, carrier=one.name) for one in solids(model, list(links), root, True)]
 
 

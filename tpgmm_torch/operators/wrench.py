@@ -111,22 +111,22 @@ class Wrench(Operator):
         touches = (force.norm(dim=-1, keepdim=True) >= self.contact).to(local)
         return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
 
-    def pose(self, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
-        """The pose of the frame."""
-        if self.frame in state.links:
+    def pose(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Frame:
+        """The pose of the frame; only that of a link needs the state."""
+        if state is not None and self.frame in state.links:
             return state.pose(self.frame)
         if self.frame not in frames:
-            known = [*frames, *state.links]
+            known = [*frames, *(() if state is None else state.links)]
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
 
-    def directions(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def directions(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Tensor:
         """The axes (..., n_axes, 3) in the base frame."""
         rotation = quaternions.to_matrix(self.pose(state, frames).orientation)
         return rotation.mT[..., list(self._axes), :]
 
     def components(
-        self, vector: Tensor, state: RobotState, frames: Mapping[str, Frame]
+        self, vector: Tensor, state: RobotState | None, frames: Mapping[str, Frame]
     ) -> Tensor:
         """Components (..., n_axes) along the axes, of a vector (..., 3) in the base frame."""
         return (self.directions(state, frames) @ vector.unsqueeze(-1)).squeeze(-1)

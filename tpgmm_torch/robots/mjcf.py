@@ -65,20 +65,29 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
     DataError
         If MuJoCo cannot compile it.
     """
+    if (tag := parse_xml(description_text(mjcf)).tag) != "mujoco":
+        raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
+    return _Translation(compiled(mjcf, "the MJCF")).text()
+
+
+def mujoco_module(purpose: str) -> Any:
+    """MuJoCo, or a DependencyError that says what it is needed for and how to install it."""
     try:
         import mujoco
     except ImportError as error:
-        raise DependencyError(f"reading MJCF needs MuJoCo: {HOW_TO_INSTALL}") from error
-    if (tag := parse_xml(description_text(mjcf)).tag) != "mujoco":
-        raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
+        raise DependencyError(f"{purpose}: this needs MuJoCo, {HOW_TO_INSTALL}") from error
+    return mujoco
+
+
+def compiled(mjcf: str | os.PathLike[str], what: str) -> Any:
+    """The compiled model of an MJCF, a path or the text itself, that errors call ``what``."""
+    mujoco = mujoco_module(f"compiling {what}")
     try:
         if is_text(mjcf):
-            model = mujoco.MjModel.from_xml_string(description_text(mjcf).rstrip())
-        else:
-            model = mujoco.MjModel.from_xml_path(os.fspath(mjcf))
+            return mujoco.MjModel.from_xml_string(description_text(mjcf).rstrip())
+        return mujoco.MjModel.from_xml_path(os.fspath(mjcf))
     except (ValueError, mujoco.FatalError) as error:
-        raise DataError(f"MuJoCo cannot compile the MJCF: {error}") from error
-    return _Translation(model).text()
+        raise DataError(f"MuJoCo cannot compile {what}: {error}") from error
 
 
 class _Translation:

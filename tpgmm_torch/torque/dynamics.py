@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_torch.obstacles.shapes import mujoco_module
+from tpgmm_torch.robots.mjcf import mujoco_module
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
@@ -72,7 +72,7 @@ class MujocoDynamics:
     """
 
     def __init__(self, robot: Robot, model: Any = None) -> None:
-        self._mujoco = mujoco = mujoco_module()
+        self._mujoco = mujoco = mujoco_module("MujocoDynamics")
         self._model = model = _compiled(robot.model.text if model is None else model)
         self._data, names = mujoco.MjData(model), robot.joint_names
         known = [model.joint(j).name for j in range(model.njnt)]
@@ -120,7 +120,7 @@ class MujocoDynamics:
 
 def _compiled(source: Any) -> Any:
     """A model of its own, without contacts."""
-    mujoco, root = mujoco_module(), parse_xml(description_text(source))
+    mujoco, root = mujoco_module("MujocoDynamics"), parse_xml(description_text(source))
     for link in root.iter("link"):  # of a URDF, without the meshes that MuJoCo would look for
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
@@ -150,6 +150,6 @@ def _efforts(model: Any) -> Array:
     controls = largest(is_motor, model.actuator_gainprm[:, :1] * model.actuator_ctrlrange)
     forces = largest(model.actuator_forcelimited, model.actuator_forcerange)
     forces = np.minimum(forces, controls) * np.abs(model.actuator_gear[:, 0])
-    drives = model.actuator_trntype == int(mujoco_module().mjtTrn.mjTRN_JOINT)
+    drives = model.actuator_trntype == int(mujoco_module("MujocoDynamics").mjtTrn.mjTRN_JOINT)
     np.minimum.at(limits, model.actuator_trnid[drives, 0], forces[drives])
     return limits

@@ -32,7 +32,7 @@ __all__ = [
 BASIC = (
     "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components",
     "alignment", "format_", "dataset", "situations", "situation", "object_", "live", "joint",
-    "cell", "rate", "n_situations", "n_demonstrations", "random_state", "to", "name", "board",
+    "cell", "rate", "n_situations", "n_demonstrations", "random_state", "name", "board",
     "tag", "cube", "size", "hand", "check", "env", "policies", "demonstrations", "seeds",
     "budget", "conditions",
 )  # fmt: skip

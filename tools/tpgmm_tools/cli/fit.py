@@ -250,8 +250,9 @@ def _recording_summary(
 
 def _unit(unit: str | Scale) -> str:
     """A unit in words, or as the numbers that turn a stored value into it."""
-    numbers = isinstance(unit, Scale) and f"{unit.factor:.4g} x value {unit.offset:+.4g}"
-    return f"{numbers} rad or m" if numbers else str(unit).replace("auto", "rad or m")
+    if isinstance(unit, Scale):
+        return f"{unit.factor:.4g} x value {unit.offset:+.4g} rad or m"
+    return "rad or m" if unit == "auto" else unit
 
 
 def _echo(lines: dict[str, object]) -> None:

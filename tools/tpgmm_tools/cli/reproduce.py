@@ -138,10 +138,10 @@ def _touches(
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
-    from tpgmm_torch.metrics import largest_acceleration, largest_velocity
+    from tpgmm_torch.metrics import largest_acceleration, largest_speeds
 
     joints, tolerance = trajectory.joints, 1e-6
-    speed = (joints.diff(dim=0) / trajectory.time.diff()[:, None]).abs().amax(0)
+    speed = largest_speeds(trajectory)
     beyond = (kinematics.lower - joints).maximum(joints - kinematics.upper).amax(0)
     fast = speed > kinematics.velocity * (1 + tolerance)
     problems = [
@@ -153,7 +153,7 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
     novelty = trajectory.novelty
     return (
         f"{float(trajectory.time[-1] - trajectory.time[0]):6.2f} s  "
-        f"speed <= {largest_velocity(trajectory):.3g} rad/s  "
+        f"speed <= {float(speed.max()):.3g} rad/s  "
         f"acceleration <= {largest_acceleration(trajectory):.3g} rad/s^2  "
         f"{', '.join(problems) or 'within limits'}"
         f"{'' if novelty is None else f'  novelty {novelty:.2g}'}"
