@@ -194,8 +194,7 @@ def open_recording(
     detectors = event_sources(events, sources, stored, columns.names)
     assembly = Assembly(layout, columns, sources, detectors, robot, rate, trim)
     # one unit for all episodes: a quiet one does not decide
-    stated = stated_range(layout.root, feature.key, feature.width)
-    if stated is not None:
+    if (stated := stated_range(layout.root, feature.key, feature.width)) is not None:
         assembly.joints.values(stated, file="meta/stats.json")
     findings = () if joints else tuple(commanded_joints(layout, feature.key))
     if frames is None and (objects := layout.features.get(ENVIRONMENT)) and objects.misnamed:
@@ -296,7 +295,8 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     joints : str, optional
         The feature that holds the joints, or ``"measured"`` (``observation.state``, ``state``
         and their variants) or ``"commanded"`` (``action``). The default is what was measured,
-        else what was commanded. Measured joints lag behind commanded ones.
+        else what was commanded. Measured joints lag behind commanded ones; what the robot
+        holds is found in them where commanded ones are read, as the demonstrations' ``holds``.
     joint_names : mapping or sequence of str, or "robot", optional
         Names instead of the data set's: all of them in order, or name in the set to name of
         the robot's joint for those that differ. ``"robot"``: the values are the robot's joints

@@ -119,9 +119,7 @@ def guess_unit(lowest: float, highest: float) -> str:
     largest = max(abs(lowest), abs(highest))
     if largest <= LARGEST_ANGLE:
         return "rad"
-    if largest <= 100.5:
-        return "deg or normalised"
-    return "deg" if largest <= 360 else "ticks"
+    return "deg or normalised" if largest <= 100.5 else "deg" if largest <= 360 else "ticks"
 
 
 def with_pose_units(names: Sequence[str] | None, units: Sequence[str]) -> tuple[str, ...]:

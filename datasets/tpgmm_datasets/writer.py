@@ -253,9 +253,8 @@ def add_frames(
         whole = reduce(merge_statistics, found.values())
         for listed in (path / "meta" / "episodes").glob("*/*.parquet"):
             file = listed.relative_to(path)
-            episodes = read_columns(listed, path, ["episode_index"])[
-                "episode_index"
-            ].to_pylist()
+            [column] = read_columns(listed, path, ["episode_index"]).columns
+            episodes = column.to_pylist()
             stats = {}
             for feature, name in ((key, name) for key in whole for name in whole[key]):
                 key = f"stats/{feature}/{name}"

@@ -27,7 +27,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["attach_holds", "demonstrated_holds", "find_holds", "with_holds"]
+__all__ = ["attach_holds", "demonstrated_holds", "find_holds", "holding_as_in", "with_holds"]
 
 #: What moved by less than so many tolerances may as well have been jolted, or seen badly.
 TRAVEL = 3.0
@@ -52,7 +52,8 @@ def find_holds(
     does when the object starts to move. A hand that closes may shift the object by up to three
     tolerances. It ends midway between when the object is put down and when the link leaves it.
     Over demonstrations the median counts. Of two hands that carry an object, the one in which
-    it is steadier in most demonstrations holds it.
+    it is steadier in most demonstrations holds it. In a demonstration that says itself what is
+    held, nothing is looked for.
 
     Parameters
     ----------
@@ -152,14 +153,32 @@ def with_holds(
     return [replace(one, holds=tuple(holds)) for one in demonstrations]
 
 
+def holding_as_in(
+    demonstration: Demonstration, joints: Tensor, kinematics: Kinematics
+) -> Demonstration:
+    """A demonstration with what the robot holds in it where its joints are others.
+
+    Commanded joints are ahead of what they carry: what is held is found in measured ones.
+
+    Parameters
+    ----------
+    demonstration : Demonstration
+    joints : Tensor of shape (T, n_joints)
+        In the order of the demonstration's.
+    kinematics : Kinematics
+    """
+    seen = replace(demonstration, joints=joints)
+    return replace(demonstration, holds=find_holds([seen], kinematics))
+
+
 def demonstrated_holds(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
 ) -> tuple[Hold, ...]:
-    """Holds of the objects that operators refer to, as the demonstrations' own ``holds`` say.
+    """Holds of the objects that operators refer to, as the demonstrations' own ``holds`` agree.
 
-    Where they say nothing and objects move with a link, there is a warning.
+    Where the first says nothing and objects move with a link, there is a warning.
 
     Parameters
     ----------
@@ -173,22 +192,13 @@ def demonstrated_holds(
 
     Raises
     ------
-    DataError, UnknownNameError
-        If demonstrations differ in their holds, or a link is not the robot's.
+    UnknownNameError
+        If a link is not the robot's.
     """
     names = frame_names(operators, kinematics)
-    first = demonstrations[0].holds
-    for number, one in enumerate(demonstrations):
-        if one.holds != first:
-            raise DataError(
-                f"demonstration {number} has the holds {one.holds}, demonstration 0 has "
-                f"{first}: give all the same, attach_holds(demonstrations, robot) after "
-                "alignment"
-            )
-    if first is not None:
-        checked = check_holds(first, demonstrations[0].frames, kinematics.links)
-        return tuple(hold for hold in checked if hold.frame in names)
     found = find_holds(demonstrations, kinematics, frames=names)
+    if demonstrations[0].holds is not None:
+        return found
     if found:
         warnings.warn(
             f"objects move as if links held them ({', '.join(map(str, found))}, in seconds), "
@@ -223,6 +233,8 @@ class _Motion:
 
     def holds(self, name: str) -> list[Hold]:
         """The holds of an object, in the order of time."""
+        if self.demonstration.holds is not None:
+            return [hold for hold in self.demonstration.holds if hold.frame == name]
         pose, change = self.demonstration.frames[name], self.change
         if not pose.batch_shape or float(change(pose[:1], pose).max()) <= TRAVEL:
             return []

@@ -228,8 +228,7 @@ def drop_outliers(
     """
     known, operators = check_demonstrations(demonstrations), check_operators(operators)
     kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
-    if known[0].holds is None:
-        known = attach_holds(known, kinematics)
+    known = attach_holds(known, kinematics)
     outlying = outlying_demonstrations(
         known, operators, kinematics, threshold=threshold, duration=duration
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from tpgmm_datasets.conversion.joints import JointColumns
+from tpgmm_datasets.conversion.joints import COMMANDED, MEASURED, JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose, MeasuredPoses
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
@@ -23,6 +23,8 @@ from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.hold_detection import holding_as_in
 
 __all__ = [
     "Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources",
@@ -185,12 +187,25 @@ class Assembly:
         """Features that have to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        wrenches = wrench_features(self.layout)
-        return [self.joints.feature, *objects, *event_features(self.layout), *wrenches]
+        joints = [one.feature for one in (self.joints, self.measured) if one]
+        return [*joints, *objects, *event_features(self.layout), *wrench_features(self.layout)]
+
+    @property
+    def measured(self) -> JointColumns | None:
+        """The measured joints, where ``joints`` are the same as they are commanded.
+
+        In them it is found what the robot holds.
+        """
+        stored, own = self.layout.features, self.joints.feature
+        state = next((stored[key] for key in MEASURED if key in stored), own)
+        alike = state != own and (state.names, state.width) == (own.names, own.width)
+        known = own.key in COMMANDED and isinstance(self.robot, Kinematics)
+        return replace(self.joints, feature=state) if alike and known else None
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
-        joints = self.joints.values(rows.values[self.joints.feature.key], **rows.episode.where)
+        where, measured = rows.episode.where, self.measured
+        joints = self.joints.values(rows.values[self.joints.feature.key], **where)
         demonstration = Demonstration(
             torch.from_numpy(rows.time),
             torch.from_numpy(joints),
@@ -199,9 +214,12 @@ class Assembly:
             flagged_events(rows),
             wrenches=stored_wrenches(rows),
         )
+        if measured is not None:
+            joints = measured.values(rows.values[measured.feature.key], **where)
+            demonstration = holding_as_in(demonstration, torch.from_numpy(joints), self.robot)
         demonstration = self._with_events(demonstration, rows)
         if self.trim is not None:
-            demonstration = trim(demonstration, self.trim, **rows.episode.where)
+            demonstration = trim(demonstration, self.trim, **where)
         demonstration = self._with_links(demonstration, rows)
         if self.rate is not None:
             demonstration = resample(demonstration, self.rate)
@@ -233,7 +251,4 @@ class Assembly:
             if isinstance(source, LinkPose):
                 time = source.time(demonstration, **rows.episode.where)
                 frames[name] = source.frame(demonstration, self.robot, time)
-        if len(frames) == len(demonstration.frames):
-            return demonstration
-        ordered = {name: frames[name] for name in self.frames}
-        return replace(demonstration, frames=ordered)
+        return replace(demonstration, frames={name: frames[name] for name in self.frames})

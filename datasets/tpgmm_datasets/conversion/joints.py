@@ -166,10 +166,8 @@ def _robots_names(
     if names is None and feature.width == len(robot.joint_names) == 1:
         names = tuple(robot.joint_names)
     if names is None:
-        joints = f"the robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}"
-        message = (
-            f"the set does not name its {feature.width} values, nor say which are {joints}"
-        )
+        these = f"the robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}"
+        message = f"the set does not name its {feature.width} values, nor say which are {these}"
         raise DatasetError(f"{message}. {NAME_ALL}", column=feature.key)
     matched = match_names(robot.joint_names, names, feature.key)
     return tuple(matched.get(name, name) for name in names)

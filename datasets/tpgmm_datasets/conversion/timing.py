@@ -99,7 +99,7 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     >>> trim(shown, speed=0.1).time.tolist()
     [0.0, 1.0, 2.0]
     """
-    time = demonstration.time
+    time, holds = demonstration.time, demonstration.holds
     speeds = (demonstration.joints.diff(dim=0) / time.diff()[:, None]).abs().amax(dim=1)
     moving = torch.nonzero(speeds > speed).flatten()
     if not len(moving):
@@ -114,5 +114,6 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     return replace(
         demonstration.at_steps(kept),
         time=time[kept] - first,
+        holds=holds and tuple(hold.retimed(lambda at: at - first) for hold in holds),
         events={n: min(max(at, first), last) - first for n, at in demonstration.events.items()},
     )

@@ -78,10 +78,8 @@ def features_of(
     given = dict(units or {})
     for name, unit in given.items():
         if name not in (names or ()) or unit not in JOINT_UNITS:
-            wanted = (
-                f"the joints are {names}, their units in demonstrations {list(JOINT_UNITS)}"
-            )
-            raise DatasetError(f"units gives {name!r} the unit {unit!r}; {wanted}")
+            known = f"the joints are {names}, their units in demonstrations {list(JOINT_UNITS)}"
+            raise DatasetError(f"units gives {name!r} the unit {unit!r}; {known}")
     listed = [given.get(name, "rad") for name in names or [""] * first.n_joints]
     joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
     features = {STATE: joints}
@@ -151,15 +149,12 @@ def demonstration_columns(
             "tpgmm_datasets.resample(demonstration, fps)"
         )
     joints = as_array(demonstration.joints)
-    columns: dict[str, Array] = {
-        STATE: joints,
-        ACTION: np.concatenate((joints[1:], joints[-1:])),
-    }
+    ahead = np.concatenate((joints[1:], joints[-1:]))
+    columns: dict[str, Array] = {STATE: joints, ACTION: ahead}
     if demonstration.frames:
-        order = [
-            n.removesuffix(".x") for n in features[ENVIRONMENT]["names"][:: len(POSE_PARTS)]
-        ]
-        poses = [pose_values(demonstration.frame(name), steps) for name in order]
+        first = features[ENVIRONMENT]["names"][:: len(POSE_PARTS)]
+        order = [demonstration.frame(name.removesuffix(".x")) for name in first]
+        poses = [pose_values(frame, steps) for frame in order]
         columns[ENVIRONMENT] = np.concatenate(poses, axis=1)
     for link, wrench in demonstration.wrenches.items():
         columns[WRENCH + link] = as_array(wrench)

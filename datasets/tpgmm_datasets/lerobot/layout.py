@@ -250,14 +250,13 @@ def _feature(key: str, entry: Any) -> Feature:
     if width > MOST_VALUES and dtype not in CAMERAS:
         message = f"a row has {width} values ({shape!r}); at most {MOST_VALUES} are read"
         raise DatasetError(message, file=INFO, column=key)
-    extra = entry.get("info")
-    units = extra.get("units") if isinstance(extra, dict) else None
+    extra = about if isinstance(about := entry.get("info"), dict) else {}
     names, misnamed = value_names(entry.get("names"), width, key)
-    listed, wrong = value_names(units, width, distinct=False)
+    listed, wrong = value_names(extra.get("units"), width, distinct=False)
     if wrong:
         message = f"its units cannot be used, {wrong}: mend them, or leave them out"
         raise DatasetError(message, file=INFO, column=key)
-    offsets = extra.get("offsets") if isinstance(extra, dict) else None
+    offsets = extra.get("offsets")
     if offsets is not None and not _numbers(offsets, width):
         message = f"its joint offsets are {width} numbers in radians, got {str(offsets)[:80]}"
         raise DatasetError(message, file=INFO, column=key)

@@ -51,7 +51,7 @@ from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.training.hold_detection import with_holds
+from tpgmm_torch.training.hold_detection import holding_as_in, with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
@@ -155,8 +155,7 @@ class Learner:
         if training and recorder is not None:
             repeated = recorder.record(batch)
             if not self._begun:
-                present = str(recorder)
-                log.info("collecting: the loss is 0 until every frame has come; %s", present)
+                log.info("collecting: the loss is 0 until every frame has come; %s", recorder)
             self._begun = True
             if not (repeated and recorder.complete):
                 # no gradient, not a zero one: an optimizer's momentum must not move anything
@@ -311,8 +310,7 @@ class Learner:
         """Demonstrations with the events and the frames at links that are asked for."""
         config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
-        named = config.training.alignment.startswith("events")
-        if self._stored and (poses or named):
+        if self._stored and (poses or config.training.alignment.startswith("events")):
             # LeRobot's preprocessor hands no such columns on
             log.info("reading events: %s", ", ".join(self._stored))
             stored = stored_events(Path(self._dataset.root), shown)
@@ -351,17 +349,15 @@ class Learner:
             covariance_type=config.em.covariance_type,
         )
         widths = [mean.shape[1] for mean in self._mixture.means]
-        isotropic = config.em.covariance_type == "spherical"
-        scales = moments.scales(widths, isotropic=isotropic)
-        added = torch.from_numpy(shares * scales**2)
-        return list(added.to(self._mixture.time).split(widths))
+        scales = moments.scales(widths, isotropic=config.em.covariance_type == "spherical")
+        return list(torch.from_numpy(shares * scales**2).to(self._mixture.time).split(widths))
 
     def _demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:
         rows = {key: column.to(self._mixture.time.device) for key, column in columns.items()}
         joints = self._shown(rows).cpu()
         follow = self._config.control.follow_frames
         frames = self._frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
-        return Demonstration(
+        shown = Demonstration(
             torch.arange(len(joints), dtype=torch.float64) / self._fps,
             joints,
             {name: (f if follow else f[0]).to("cpu") for name, f in frames.items()},
@@ -372,6 +368,10 @@ class Learner:
                 if key.startswith(WRENCH)
             },
         )
+        if self._config.training.learn_from == "commanded":
+            joints = self._joints.joints(rows[OBS_STATE]).cpu()
+            shown = holding_as_in(shown, joints, self._kinematics.to(device="cpu"))
+        return shown
 
     def _shown(self, rows: Mapping[str, Tensor]) -> Tensor:
         """The joint vectors (B, n_joints) that a demonstration is made of."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.carrying import lagging_set
 from tests.support.errands import HAND
 from tests.support.policies import act, loaded, seen
 from tests.support.skills import HANDLING, HANDS, same
@@ -27,6 +28,7 @@ from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment, LinearTime
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import encode
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
@@ -147,7 +149,7 @@ def test_several_ways_are_found_and_each_robot_goes_the_one_that_suits(tmp_path)
         assert float((tip(joints) - handles).norm(dim=-1).min()) < 0.015
 
 
-def test_commanded_joints_are_learned_by_name(commanded):
+def test_commanded_joints_are_learned_by_name(commanded, tmp_path):
     options = {**WAVES, "alignment": "linear"}
     for joints in ("measured", "commanded"):
         demonstrations = load_lerobot(commanded.root, joints=joints, robot=JointSpace(NAMES))
@@ -156,6 +158,11 @@ def test_commanded_joints_are_learned_by_name(commanded):
         same(policy.to_estimator(), TaskParameterizedGMM(**WAVES).fit(aligned), 1e-9)
         loss, _ = policy.train().forward(epoch(commanded, 32)[0])
         assert loss < 0  # what was learned is likely
+    options = {"robot": encode(Poses(["hand"])), "operators": ["position:hand@bottle"]}
+    options |= {"alignment": "none", "n_components": 2}
+    lagging = dataset(lagging_set(tmp_path / "lagging"))
+    one, other = (trained(lagging, learn_from=j, **options) for j in ("measured", "commanded"))
+    assert len(one.skill.holds) == 1 and one.skill.holds == other.skill.holds
     with pytest.raises(DataError, match=r"--policy\.training\.learn_from=commanded goes with"):
         fresh(commanded, learn_from="commanded", loss="imitation", **WAVES)
 

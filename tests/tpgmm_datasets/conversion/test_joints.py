@@ -1,7 +1,10 @@
 """Which values are the joints, and what they are called."""
 
+from dataclasses import replace
+
 import pytest
 
+from tests.support.carrying import lagging_set
 from tests.support.lerobot_sets import (
     DATA,
     Arm,
@@ -12,7 +15,9 @@ from tests.support.lerobot_sets import (
     to_v21,
 )
 from tpgmm_datasets import DatasetError, load_lerobot
+from tpgmm_torch import find_holds
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.robots import Poses
 
 
 @pytest.mark.parametrize("names", [None, [], {}, ["state"]])
@@ -51,6 +56,17 @@ def test_the_joint_feature_is_found_or_chosen(root):
         root, lambda i: i["features"].update(state=i["features"].pop("observation.state"))
     )
     assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def test_what_is_held_is_found_in_measured_joints(tmp_path):
+    options = {"path": lagging_set(tmp_path / "set"), "robot": (hand := Poses(["hand"]))}
+    commanded, measured = (load_lerobot(joints=j, **options) for j in ("commanded", "measured"))
+    [hold] = find_holds(measured, hand)
+    assert find_holds(commanded, hand) == (hold,)
+    assert find_holds([replace(one, holds=None) for one in commanded], hand) != (hold,)
+    shown = load_lerobot(joints="commanded", rate=10, trim=0.01, **options)
+    [other] = find_holds(shown, hand)
+    assert (other.begin, other.end) == pytest.approx((hold.begin, hold.end), abs=0.06)
 
 
 def renamed(root, name):

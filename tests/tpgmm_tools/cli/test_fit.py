@@ -1,6 +1,7 @@
 """``tpgmm fit``: options reach the model, and the report says what was learned."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from tests.support.carrying import lagging_set
 from tests.support.command_line import UPPER_BODY, output, refusal, run
 from tests.support.mistakes import written_arms
 from tests.support.skills import waves
@@ -69,6 +71,16 @@ def test_fit_takes_tracked_poses_in_place_of_a_robot(tmp_path):
     operators = ("--operator", "pose:left", "--operator", "pose:right@left")
     output("fit", tmp_path / "hands", *poses, *operators, "--out", tmp_path / "model")
     assert load_model(tmp_path / "model").kinematics_ == kinematics
+
+
+def test_commanded_joints_hold_what_measured_ones_do(tmp_path):
+    given = "fit", lagging_set(tmp_path / "set"), "--poses", "hand", *QUICK[:2], *QUICK[-4:]
+    texts = [
+        output(*given, "--joints", joints, "--out", tmp_path / joints)
+        for joints in ("measured", "commanded")
+    ]
+    one, other = (re.search("held .*", text)[0] for text in texts)
+    assert one == other and "bottle@hand" in one
 
 
 def test_implausible_recordings_and_files_in_the_way_are_refused(dataset, tmp_path):

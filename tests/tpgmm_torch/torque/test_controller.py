@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.torque_arm import (
-    BOARD,
-    LIMITS,
-    POSTURE,
-    WIPING,
-    Simulation,
-    dynamics,
-    skill,
-)
+from tests.support.torque_arm import BOARD, LIMITS, POSTURE, WIPING, Simulation, dynamics, skill
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
 from tpgmm_torch.operators.wrench import Wrench
 from tpgmm_torch.torque import TorqueController, TorqueGains
