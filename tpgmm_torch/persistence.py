@@ -133,6 +133,7 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
     Parameters
     ----------
     path : str or Path
+        Its folder, or that of a policy of type ``tpgmm``, which holds it.
     custom : sequence of type
         Your own operators and robots that occur in it; no other code is ever looked up.
     device : str, optional
@@ -164,8 +165,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     config = _parsed(path / CONFIG, json.loads)
     if not isinstance(config, dict) or config.get("format") != FORMAT["format"]:
         kind = config.get("type") if isinstance(config, dict) else None
+        if kind == "tpgmm":  # a TPGMMPolicy
+            return _read(path / "model")
         hint = f": it is a LeRobot policy of type {kind!r}, opened by its from_pretrained(path)"
-        hint += f"; of a TPGMMPolicy, {path / 'model'} is the model" if kind == "tpgmm" else ""
         raise ModelFileError(f"{path / CONFIG} describes no model{hint if kind else ''}")
     if config.get("version") != FORMAT["version"]:
         raise ModelFileError(

@@ -37,7 +37,7 @@ def directory(tmp_path_factory):
     printed = output("fit", folder / "set", *BOTTLE, "--out", folder / "policy")
     saved, following = printed.splitlines()[-2:]
     assert saved.endswith(f" {folder / 'policy'}")
-    assert f"tpgmm report {folder / 'policy' / 'model'} --dataset" in following
+    assert f"tpgmm report {folder / 'policy'} --dataset" in following
     return folder / "policy"
 
 

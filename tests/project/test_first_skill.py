@@ -96,7 +96,7 @@ def test_the_cup_is_grasped_where_it_was_not_shown(made, monkeypatch):
     joints = dict(zip(robot.joint_names, home, strict=True))
     monkeypatch.chdir(made)
     Path("new.json").write_text(json.dumps([{"joints": joints, "frames": {"cup": pose}}]))
-    output("reproduce", "out/policy/model", "--situations", "new.json", "--out", "out/new.csv")
+    output("reproduce", "out/policy", "--situations", "new.json", "--out", "out/new.csv")
     [motion] = demonstrations_from_frame(read_table("out/new.csv"))
     step = int((motion.time - (AT + HALF / 2)).abs().argmin())
     assert misses(motion.reordered(robot.joint_names).joints[step]) < 1e-3

@@ -174,7 +174,7 @@ def test_other_folders_are_left_alone_and_refused(tmp_path):
     with pytest.raises(ModelFileError, match="is missing"):
         load(tmp_path / "nowhere")
     (tmp_path / "policy").mkdir()
-    (tmp_path / "policy" / "config.json").write_text('{"type": "tpgmm"}')
+    (tmp_path / "policy" / "config.json").write_text('{"type": "act"}')
     with pytest.raises(ModelFileError, match="describes no model: it is a LeRobot policy"):
         load(tmp_path / "policy")
 

@@ -180,8 +180,7 @@ def fit(
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
-    place = Path(out, "model") if Path(out, "model").is_dir() else out
-    typer.echo(f"next             tpgmm report {place} --dataset {dataset}")
+    typer.echo(f"next             tpgmm report {out} --dataset {dataset}")
 
 
 class Aligned:
