@@ -25,14 +25,15 @@ from tpgmm_torch.checks.summary import UNLIKELY
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
-from tpgmm_torch.obstacles import Scene, find_contacts
+from tpgmm_torch.obstacles import Contact, Scene, find_contacts
 from tpgmm_torch.operators.base import of_joints
 
-__all__ = ["LeftOut", "leave_one_out", "write_report"]
+__all__ = ["LeftOut", "contacts", "leave_one_out", "write_report"]
 
 #: Joints whose candidates are drawn: those that move most.
 DRAWN = 4
@@ -205,13 +206,20 @@ def write_report(
     return left_out
 
 
+def _errors(
+    left_out: Sequence[LeftOut], first: int
+) -> Iterable[tuple[tuple[str, ...], list[tuple[float, float]]]]:
+    """All errors by link and event, or from the ``first`` of these on."""
+    at: dict[tuple[str, ...], list[tuple[float, float]]] = {}
+    for one in left_out:
+        for place, errors in one.errors.items():
+            at.setdefault(place[first:], []).append(errors)
+    return at.items()
+
+
 def _glance(left_out: Sequence[LeftOut]) -> Iterator[str]:
     """Errors at events, and episodes that are unlike the others."""
-    at: dict[str, list[tuple[float, float]]] = {}
-    for one in left_out:
-        for (_, event), errors in one.errors.items():
-            at.setdefault(event, []).append(errors)
-    for event, pairs in at.items():
+    for (event,), pairs in _errors(left_out, 1):
         (mm, deg), (most, _) = np.quantile(pairs, [0.5, 0.9], axis=0)
         yield (
             f"At '{event}' links are {mm:.2g} mm and {deg:.2g} deg from where an episode that "
@@ -232,10 +240,8 @@ def _events(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
 
 def _exactness(left_out: Sequence[LeftOut]) -> str:
     """Errors by link and event, over the demonstrations that were left out."""
-    keys = dict.fromkeys(key for one in left_out for key in one.errors)
     rows = []
-    for link, event in keys:
-        pairs = [one.errors[link, event] for one in left_out if (link, event) in one.errors]
+    for (link, event), pairs in _errors(left_out, 0):
         (mm, deg), (mm_90, deg_90) = np.quantile(pairs, [0.5, 0.9], axis=0)
         rows.append(
             [link, event, f"{mm:.2g} / {mm_90:.2g}", f"{deg:.2g} / {deg_90:.2g}", len(pairs)]
@@ -317,21 +323,38 @@ def _obstacles(
     if scene is None:
         return [], ""
     rows = [
-        [
-            number, one.one, one.other, f"{one.begin:.1f} to {one.end:.1f}",
-            f"{1e3 * one.depth:.0f}",
-        ]
-        for number, (situation, motion) in enumerate(zip(situations, motions, strict=True))
-        for one in find_contacts(
-            scene, motion.time, motion.joints, situation.frames_at(motion.time), model.holds_
-        )
-    ]  # fmt: skip
+        [number, a.one, a.other, f"{a.begin:.1f} to {a.end:.1f}", f"{1e3 * a.depth:.0f}"]
+        for number, a in contacts(scene, motions, situations, model.holds_)
+    ]
     count = len({row[0] for row in rows})
     said = f"Something touches in {count or 'none'} of {len(motions)} motions."
     allowed = (f"{one} and {other}: {why}" for (one, other), why in scene.allowed.items())
     head = ["episode", "what", "touches", "from, to [s]", "by [mm]"]
     text = f"<p>{said}</p>{_table(head, rows) if rows else ''}"
     return [said], f"{text}<details><summary>pairs that may</summary>{_list(allowed)}</details>"
+
+
+def contacts(
+    scene: Scene,
+    motions: Iterable[Trajectory],
+    situations: Iterable[Situation],
+    holds: Sequence[Hold],
+) -> Iterator[tuple[int, Contact]]:
+    """What touches what in motions, each in its situation, with the motion's number.
+
+    Parameters
+    ----------
+    scene : Scene
+    motions : iterable of Trajectory
+    situations : iterable of Situation
+        As many.
+    holds : sequence of Hold
+        What the robot holds meanwhile.
+    """
+    for number, (one, situation) in enumerate(zip(motions, situations, strict=True)):
+        frames = situation.frames_at(one.time.cpu())
+        for contact in find_contacts(scene, one.time, one.joints, frames, holds):
+            yield number, contact
 
 
 def _demonstrations(left_out: Sequence[LeftOut]) -> str:

@@ -105,6 +105,6 @@ def test_what_cannot_be_left_out_is_an_error(learned, tmp_path):
     assert "to leave one out takes 3 demonstrations, there are 2" in refusal(
         "report", folder / "model", "--dataset", tmp_path / "two", "--alignment", "none"
     )
-    assert "there are 4 episodes" in refusal(
+    assert "there are 4 situations" in refusal(
         "report", folder / "model", "--dataset", folder / "dataset", "--situation", 7
     )

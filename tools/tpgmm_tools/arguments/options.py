@@ -343,6 +343,16 @@ def align(
     return aligned
 
 
+def check_situation(number: int, count: int) -> None:
+    """Refuse a ``number`` of --situation behind the last of ``count`` situations."""
+    from tpgmm_torch.exceptions import DataError
+
+    if number >= count:
+        raise DataError(
+            f"there are {count} situations, counted from 0; got --situation {number}"
+        )
+
+
 def look(
     objects: list[str] | None,
     meshes: Path | None,

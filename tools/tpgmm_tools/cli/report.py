@@ -65,7 +65,6 @@ def report(
 
     from tpgmm_tools.arguments.learning import prepared
     from tpgmm_tools.report import write_report
-    from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.persistence import load_model
 
     torch.set_num_threads(1)
@@ -73,10 +72,7 @@ def report(
     robot = fitted.kinematics_
     shown = options.align(data.read(dataset, robot), alignment, robot)
     shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
-    if situation >= len(shown):
-        raise DataError(
-            f"there are {len(shown)} episodes, counted from 0: --situation {situation}"
-        )
+    options.check_situation(situation, len(shown))
     how = options.look(object_, meshes, obstacles, visuals, fitted.skill, shown)
     place = out or Path(f"{model}.html")
     folder = model.resolve()

@@ -10,10 +10,7 @@ import typer
 from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
-    from tpgmm_torch.data.frames import Frame
-    from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Trajectory
-    from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["app"]
@@ -114,27 +111,15 @@ def reproduce(
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
     if obstacles is not None:
+        from tpgmm_tools.report import contacts
+
         scene = options.scene(obstacles, skill, visuals, shown)
-        pairs = zip(trajectories, wanted, strict=True)
-        if _touches(scene, [(t, s.frames_at(t.time.cpu())) for t, s in pairs], skill.holds):
-            raise typer.Exit(COLLIDES)
-
-
-def _touches(
-    scene: Scene,
-    motions: list[tuple[Trajectory, dict[str, Frame]]],
-    holds: tuple[Hold, ...],
-) -> bool:
-    """Whether anything touches; what does is listed."""
-    from tpgmm_torch.obstacles import find_contacts
-
-    found = [find_contacts(scene, t.time, t.joints, frames, holds) for t, frames in motions]
-    for number, contacts in enumerate(found):
-        for contact in contacts:
+        found = list(contacts(scene, trajectories, wanted, skill.holds))
+        for number, contact in found:
             typer.echo(f"{number:>4}  {contact}")
-    if not any(found):
+        if found:
+            raise typer.Exit(COLLIDES)
         typer.echo("nothing touches")
-    return any(found)
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:

@@ -103,10 +103,7 @@ def view(
         raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
     fitted = load_model(where, device="cpu")
     wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
-    if situation >= len(wanted):
-        raise DataError(
-            f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
-        )
+    options.check_situation(situation, len(wanted))
     how = options.look(object_, meshes, obstacles, visuals, fitted.skill, demonstrations)
     how["fps"] = fps
     if live:
