@@ -283,11 +283,13 @@ def _separated(file: Any) -> pd.DataFrame:
     marks = [mark for mark in ",;\t" if mark in head and mark in row]
     mark = marks[0] if marks else "," if "," in head else r"\s+"
     comma = mark != "," and re.search(r"\d,\d", row)
-    # by default pandas is quicker and wrong in the last digit, and takes the first column for
-    # names of rows where these are longer than the header
+    # by default pandas takes the first column for names of rows where these are longer than the
+    # header, and before 3.1, which deprecates the option, it is wrong in the last digit
     options: dict[str, Any] = {"decimal": "," if comma else ".", "index_col": False}
-    options |= {"sep": mark, "skipinitialspace": True, "float_precision": "round_trip"}
+    options |= {"sep": mark, "skipinitialspace": True}
     pandas = _pandas()
+    if tuple(map(int, pandas.__version__.split(".")[:2])) < (3, 1):
+        options["float_precision"] = "round_trip"
     with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
         read = pandas.read_csv(file, **options)
     return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
@@ -452,10 +454,8 @@ def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
         dates = dates if kind == "m" else dates.apply(_pandas().to_datetime, **options)
         since = (dates - dates[time].iloc[0]).apply(lambda column: column.dt.total_seconds())
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
-        message = (
-            f"column {time!r} holds neither numbers nor dates, its first value is {first!r}"
-        )
-        raise DataError(f"{message}: convert it to seconds") from error
+        found = f"column {time!r} holds neither numbers nor dates, its first value is {first!r}"
+        raise DataError(f"{found}: convert it to seconds") from error
     return part.assign(**since)
 
 
