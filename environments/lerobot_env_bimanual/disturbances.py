@@ -583,9 +583,7 @@ def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
             raise DataError(f"{kind} takes no {name}, got {number:g}")
         if not number > 0:
             raise DataError(f"the {name} of {kind} is above 0, got {number:g}")
-    signed = {
-        name: math.copysign(number, vars(usual)[name]) for name, number in numbers.items()
-    }
+    signed = {name: math.copysign(size, vars(usual)[name]) for name, size in numbers.items()}
     return dataclasses.replace(usual, **signed)
 
 

@@ -185,7 +185,7 @@ def record(
         Width and height of the pictures.
     robot : str, default="upper_body"
         Who does a task of the suite, or is calibrated; ``"bi_so101"`` with both hands at once,
-        and its own offsets.
+        and its own offsets. Other tasks have a robot of their own.
     codec : {"av1", "h264", "pictures"}, default="av1"
     imperfections : Imperfections, optional
         What spoils the pictures.
@@ -361,7 +361,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--cameras", default="front", help="names, with commas between them")
     add("--fps", type=int, default=25, help="rows per second")
     add("--size", type=int, nargs=2, default=(640, 480), help="width and height of pictures")
-    add("--robot", choices=(*ROBOTS, BI_SO101), default=UPPER_BODY, help="who does it")
+    usual = f"who does it (default: {UPPER_BODY}, and {BI_SO101} for {', '.join(TASKS)})"
+    add("--robot", choices=(*ROBOTS, BI_SO101), default=argparse.SUPPRESS, help=usual)
     add("--codec", choices=CODECS, default="av1", help="of the videos")
     add("--noise", type=float, default=0.0, help="of the sensors, in demonstrations")
     add("--true-poses", action="store_true", help="demonstrations with the poses of objects")
@@ -386,8 +387,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _report_errors_alone() -> None:
     """Quieten libraries: progress is what this command says."""
+    import av
     from datasets.utils.logging import disable_progress_bar
 
+    av.logging.set_libav_level(av.logging.WARNING)
     os.environ.setdefault("SVT_LOG", "1")
     logging.getLogger("lerobot").setLevel(logging.ERROR)
     disable_progress_bar()
