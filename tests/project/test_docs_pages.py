@@ -69,7 +69,7 @@ def demo(tmp_path_factory) -> Path:
 def cell(tmp_path_factory) -> Path:
     """A folder with recordings of an arm, a cup and a board before a camera."""
     folder = tmp_path_factory.mktemp("cell")
-    recorded_cell.record(folder)
+    recorded_cell.record(folder, episodes=3)
     return folder
 
 

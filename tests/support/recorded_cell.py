@@ -172,6 +172,7 @@ def _taken(robot: Robot, rng: np.random.Generator) -> Episode:
 
 def _write(root: Path, robot: Robot, episodes: list[Episode], rng: np.random.Generator) -> None:
     """Write a set with videos with LeRobot."""
+    from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     names = [f"{name}.pos" for name in robot.joint_names]
@@ -180,8 +181,10 @@ def _write(root: Path, robot: Robot, episodes: list[Episode], rng: np.random.Gen
     camera = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
     features = {"observation.state": joint, "action": joint, KEY: camera}
     made = LeRobotDataset.create(
-        f"local/{root.name}", FPS, features, root=root, robot_type="so_follower"
-    )
+        f"local/{root.name}", FPS, features, root=root, robot_type="so_follower",
+        streaming_encoding=True, encoder_queue_maxsize=0,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264"),  # AV1 takes several times as long
+    )  # fmt: skip
     low, high = robot.lower.numpy()[-1], robot.upper.numpy()[-1]
     for joints, things in episodes:
         stored = np.degrees(joints)

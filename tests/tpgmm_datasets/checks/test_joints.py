@@ -68,7 +68,5 @@ def test_joints_that_never_move_are_named_but_not_coordinates_of_tracked_hands()
     assert "never move" in finding.message
     moves = replace(idle[3], joints=idle[3].joints + 1e-6 * torch.as_tensor(path))
     assert list(check([*idle, moves])) == []
-    plane = [
-        Demonstration(TIME, np.hstack((path, 2 * path, 0 * path)) + n / 99) for n in (1, 2)
-    ]
-    assert list(check(plane, Poses(("hand",), orientation=False))) == []
+    flat = [Demonstration(TIME, np.hstack((path, 2 * path, 0 * path)) + n / 99) for n in (1, 2)]
+    assert list(check(flat, Poses(("hand",), orientation=False))) == []

@@ -87,12 +87,10 @@ def test_frames_name_what_is_nan():
 def test_what_is_of_unit_norm_but_for_rounding_stays_bit_for_bit():
     rng = np.random.default_rng(0)
     for dtype in (torch.float64, torch.float32):
-        given = quaternions.normalize(
-            torch.from_numpy(rng.standard_normal((1000, 4))).to(dtype)
-        )
-        once = Frame(torch.zeros(1000, 3, dtype=dtype), given)
-        assert torch.equal(once.orientation, given)
-        assert torch.equal(Frame(once.position, once.orientation).orientation, given)
+        unit = quaternions.normalize(torch.from_numpy(rng.standard_normal((1000, 4))).to(dtype))
+        once = Frame(torch.zeros(1000, 3, dtype=dtype), unit)
+        assert torch.equal(once.orientation, unit)
+        assert torch.equal(Frame(once.position, once.orientation).orientation, unit)
 
 
 def test_gradients_of_an_orientation_stay_on_the_unit_sphere():

@@ -202,16 +202,14 @@ class TestSettings:
 
     @pytest.mark.parametrize("base", [None, "flange"])
     def test_tools_move_with_their_parent(self, base: str | None) -> None:
-        offset = Frame(
-            [0.1, -0.2, 0.3], quaternions.exp(torch.tensor([0.3, -1.0, 0.5]).double())
-        )
-        tools = {"cup": ("r_finger", offset), "pen": ("ground", [0, 0, 0.1])}
+        grip = Frame([0.1, -0.2, 0.3], quaternions.exp(torch.tensor([0.3, -1.0, 0.5]).double()))
+        tools = {"cup": ("r_finger", grip), "pen": ("ground", [0, 0, 0.1])}
         robot = zoo(("cup", "r_finger", "pen", "ground"), tools=tools, base=base)
         joints = random_joints(robot)
         state = robot.state(joints)
         parent = Frame(state.position("r_finger"), state.orientation("r_finger"))
-        turned = quaternions.product(parent.orientation, offset.orientation)
-        torch.testing.assert_close(state.position("cup"), parent.transform(offset.position))
+        turned = quaternions.product(parent.orientation, grip.orientation)
+        torch.testing.assert_close(state.position("cup"), parent.transform(grip.position))
         torch.testing.assert_close(
             quaternions.to_matrix(state.orientation("cup")), quaternions.to_matrix(turned)
         )

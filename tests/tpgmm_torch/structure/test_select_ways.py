@@ -72,12 +72,10 @@ def test_skills_of_one_way_are_one_mode():
         assert SelectWays(learner(None, HAND)).fit(planted).n_ways_ == 1
 
 
-@pytest.mark.parametrize(
-    "offsets", [(0.5, -0.5, 0.0), (0.5, 0.8, -0.5), (1.0, 0.5, -0.5, -1.0)]
-)
-def test_more_than_two_ways_are_found(offsets):
-    labels = np.arange(5 * len(offsets)) % len(offsets)
-    selection = SelectWays(learner()).fit(paths(np.array(offsets)[labels]))
+@pytest.mark.parametrize("shifts", [(0.5, -0.5, 0.0), (0.5, 0.8, -0.5), (1.0, 0.5, -0.5, -1.0)])
+def test_more_than_two_ways_are_found(shifts):
+    labels = np.arange(5 * len(shifts)) % len(shifts)
+    selection = SelectWays(learner()).fit(paths(np.array(shifts)[labels]))
     assert same_partition(selection.labels_, labels)
 
 

@@ -84,9 +84,7 @@ def test_what_varies_by_rounding_alone_is_made_constant():
     joints = rng.normal(size=(30, 3))
     joints[:, 1] = 0.5 + 1e-15 * rng.normal(size=30)
     joints[:, 2] = 0.5 + 1e-9 * rng.normal(size=30)
-    pair = [
-        Demonstration(time, joints[order]) for order in (slice(None), slice(None, None, -1))
-    ]
+    pair = [Demonstration(time, joints[way]) for way in (slice(None), slice(None, None, -1))]
     kinematics = Poses(["point"], orientation=False)
     rows = local_data(pair, [Canonical()], kinematics)
     assert all((one[:, 2] == rows[0][0, 2]).all() for one in rows)
