@@ -73,8 +73,9 @@ class SuiteEnv(ControlledEnv):
     Parameters
     ----------
     task : str
-        ``handover``, ``lid``, ``peg_in_hole``, ``pour``, ``wipe``, or ``pick_place``, of which
-        the conditions ``slips`` and ``knocked`` spoil the first grasp.
+        ``handover``, ``lid``, ``peg_in_hole``, ``pour``, ``wipe``; ``pick_place``, of which
+        the conditions ``slips`` and ``knocked`` spoil the first grasp; or ``shelf``, the same
+        with a shelf between the upper body's arms.
     robot : str, default="upper_body"
         The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
         waist and arms of a Unitree G1, 17 joints.

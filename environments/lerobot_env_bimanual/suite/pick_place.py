@@ -29,7 +29,7 @@ from lerobot_env_bimanual.suite.task import Box, Judge, Leg, Pose, Style, raised
 from tpgmm_torch import Canonical, Demonstration, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["PickPlace"]
+__all__ = ["PickPlace", "Placing"]
 
 #: Where stands are, in the reach of the left hand [m].
 STANDS = (0.25, -0.04), (0.32, 0.0)
@@ -79,7 +79,7 @@ class PickPlace(Handover):
 
     def judge(self) -> Judge:
         """Opens the hand when the baton is down again."""
-        return _Judge()
+        return Placing()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """The hand seen from where the baton was and from the stand, what it holds; joints."""
@@ -104,7 +104,9 @@ class PickPlace(Handover):
         return found
 
 
-class _Judge(Judge):
+class Placing(Judge):
+    """Says where the baton was put, and where the hand is then."""
+
     def __init__(self) -> None:
         self.time = 0.0
         self.lifted = self.put = False
@@ -112,17 +114,20 @@ class _Judge(Judge):
         self.opening = Closing(reach=PUT)
 
     def note(self, scene: SuiteScene, seconds: float) -> None:
+        """Keep where the hand began, and whether the baton is lifted."""
         self.first = scene.pose("l_hand") if self.first is None else self.first
         self.time += seconds
         self.lifted = LEFT in scene.held and (self.lifted or height(scene) > LIFTED)
 
     def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+        """The left hand, when the baton is down again."""
         if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
             self.put = True
             return (LEFT,)
         return ()
 
     def figures(self, scene: SuiteScene) -> dict[str, float]:
+        """Where the baton stands, and how far the hand is from where it began."""
         hand = scene.pose("l_hand")
         home = hand - (hand if self.first is None else self.first)
         placed = {**on_stand(scene), "put": float(self.put)}

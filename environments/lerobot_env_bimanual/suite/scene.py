@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -152,6 +153,19 @@ class SuiteScene(RobotScene):
         model, points = self.model, np.empty(6)
         palm, grip = (model.geom(name).id for name in (f"{hold.hand[0]}_palm", hold.grip))
         return float(mujoco.mj_geomDistance(model, self.data, palm, grip, 1.0, points))
+
+    def depth(self, body: str) -> float:
+        """How deep whatever moves is in a body that stands still, 0 if nowhere [m].
+
+        It is right with MuJoCo 3.12 or newer.
+        """
+        model, points = self.model, np.empty(6)
+        fixed = np.flatnonzero(model.geom_bodyid == model.body(body).id).tolist()
+        moving = np.flatnonzero(model.body_weldid[model.geom_bodyid]).tolist()
+        pairs = itertools.product(moving, fixed)
+        return -min(
+            mujoco.mj_geomDistance(model, self.data, *pair, 0.0, points) for pair in pairs
+        )
 
     def hold(self, hold: Hold) -> None:
         """Attach an object to a hand as it lies in it."""

@@ -11,6 +11,7 @@ from lerobot_env_bimanual.suite.peg_in_hole import PegInHole
 from lerobot_env_bimanual.suite.pick_place import PickPlace
 from lerobot_env_bimanual.suite.pour import Pour
 from lerobot_env_bimanual.suite.robots.embodiments import embodiment
+from lerobot_env_bimanual.suite.shelf import Shelf
 from lerobot_env_bimanual.suite.task import SuiteTask
 from lerobot_env_bimanual.suite.wipe import Wipe
 from tpgmm_torch.exceptions import UnknownNameError
@@ -18,7 +19,7 @@ from tpgmm_torch.exceptions import UnknownNameError
 __all__ = ["TASKS", "suite_task"]
 
 TASKS: dict[str, type[SuiteTask]] = {
-    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe, PickPlace)
+    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe, PickPlace, Shelf)
 }
 
 

@@ -9,7 +9,7 @@ import torch
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.suite import handover, pour
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.names import MORE, SUITE
+from lerobot_env_bimanual.suite.names import MORE, OBSTRUCTED, SUITE
 from lerobot_env_bimanual.suite.task import (
     BOW,
     START,
@@ -49,7 +49,7 @@ def test_a_demonstration_is_the_same_without_the_others(motions):
 
 
 def test_names_are_those_that_are_known_without_mujoco():
-    assert {*TASKS} == {*SUITE, *MORE} and {*SUITE} <= {*BENCHMARKS}
+    assert {*TASKS} == {*SUITE, *MORE, *OBSTRUCTED} and {*SUITE} <= {*BENCHMARKS}
     assert list(SUITE) == sorted(SUITE)
     with pytest.raises(UnknownNameError, match="handover"):
         suite_task("juggle")
