@@ -223,7 +223,8 @@ class Controller:
         if trust is not None:
             grips = None if self._gripping is None else self._gripping.numpy(force=True)
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
-        self._holds = Holds.start(skill, self._frames)
+        solid = () if obstacles is None else obstacles.geometry.objects
+        self._holds = Holds.start(skill, self._frames, solid)
         begin, end = _span(skill, begin, end)
         self._wrenches = _expected_contacts(skill, start, begin)
         forces = self._wrenches.thresholds

@@ -6,7 +6,7 @@ Holds that were not given are found: objects that move along with a link.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Self
@@ -255,9 +255,12 @@ class Holds:
     hidden: Mapping[str, Tensor] = MappingProxyType({})
 
     @classmethod
-    def start(cls, skill: Skill, frames: Mapping[str, Frame]) -> Self:
-        """Before anything is held, with poses of all objects."""
-        holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, frames)
+    def start(
+        cls, skill: Skill, frames: Mapping[str, Frame], solid: Iterable[str] = ()
+    ) -> Self:
+        """Before anything is held, with poses of all objects; of some the solids matter."""
+        objects = tuple(dict.fromkeys((*skill.carried_names, *solid)))
+        holding = Holding.start(skill.kinematics, objects, skill.holds, frames)
         first: dict[str, float] = {}
         for hold in holding.holds:
             first[hold.frame] = min(hold.begin, first.get(hold.frame, math.inf))

@@ -121,7 +121,7 @@ class Holding:
     kinematics : Kinematics
     holds : tuple of Hold
     objects : tuple of str
-        Those that operators refer to as things.
+        Those that operators refer to as things, or that are solids among obstacles.
     frames : mapping of str to Frame
         Poses of all objects when they were last free, as operators take them.
     held : mapping of str to Held
@@ -165,7 +165,7 @@ class Holding:
 
     @property
     def carries(self) -> bool:
-        """Whether an object that operators refer to as a thing may be held by some robot."""
+        """Whether one of the objects may be held by some robot."""
         return any(
             name in self.held and self.held[name].grasp is not None for name in self.objects
         )

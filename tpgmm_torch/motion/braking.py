@@ -2,15 +2,16 @@
 
 Bounds of position, speed, acceleration and jerk are convex: if two motions that begin alike
 keep them at all times, so does every mixture of both. Take the fastest motions towards both
-limits for one tick, to the states s_0 and s_1, and brake from there as hard as may be, to rest
-at r_0 and r_1. Then
+limits for one tick, to the states s_0 and s_2, and the motion that brakes as hard as may be, to
+s_1; brake from each as hard as may be, to rest at r_0 <= r_1 <= r_2. Then
 
-    s = (1 - x) s_0 + x s_1,   r = (1 - x) r_0 + x r_1,   0 <= x <= 1                     (B1)
+    s = (1 - x) s_i + x s_i+1,   r = (1 - x) r_i + x r_i+1,   0 <= x <= 1                 (B1)
 
 is a state after the tick, and a place where the joint can stop from there, within all bounds.
-So the place of rest, joint by joint between r_0 and r_1, decides the next reference, each is
-linear in the other, and what keeps places of rest clear of something can be kept: at the next
-tick the same place can be chosen again, but for 1e-3 rad where two ways to brake are mixed.
+So the place of rest, joint by joint between r_0 and r_2, decides the next reference, and what
+keeps places of rest clear of something can be kept: at the next tick the same place can be
+chosen again, r_1. A joint comes to rest there, which without s_1 it would not: mixtures of the
+fastest motions alone pass it from tick to tick, by a few thousandths of a radian.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.motion.follower import Follower
-from tpgmm_torch.motion.trajectory_generator import first_part, rest_positions
+from tpgmm_torch.motion.trajectory_generator import braked_part, first_part, rest_positions
 
 __all__ = ["Braking", "rest"]
 
@@ -36,9 +37,10 @@ class Braking:
 
     Parameters
     ----------
-    states : ndarray of shape (2, 3, ..., n_joints)
-        Position, velocity and acceleration after the fastest motions down and up.
-    rests : ndarray of shape (2, ..., n_joints)
+    states : ndarray of shape (3, 3, ..., n_joints)
+        Position, velocity and acceleration after the fastest motion down, the one that brakes,
+        and the fastest one up.
+    rests : ndarray of shape (3, ..., n_joints)
         Where they come to rest.
     """
 
@@ -62,21 +64,20 @@ class Braking:
             np.clip(limits.lower, start[0] - FAR, start[0]),
             np.clip(limits.upper, start[0], start[0] + FAR),
         ]
-        states = np.stack(
-            [
-                first_part(flat, end.ravel(), still, dt, rates).reshape(start.shape)
-                for end in ends
-            ]
-        )
+        down, up = (first_part(flat, end.ravel(), still, dt, rates) for end in ends)
+        braked = braked_part(flat, dt, *rates[1:])
+        braked = 0.5 * (down + up) if braked is None else braked
+        states = np.stack((down, braked, up)).reshape(3, *start.shape)
         return cls(states, np.sort(np.stack([rest(before, state) for state in states]), axis=0))
 
     def state(self, rest: Array) -> Array:
         """The state (3, ..., n_joints) from which a joint can stop at ``rest``."""
-        low, high = self.rests
+        onwards = rest > self.rests[1]
+        low, high = np.where(onwards, self.rests[1:], self.rests[:2])
+        first, second = np.where(onwards, self.states[1:], self.states[:2])
         wide = high - low
-        share = np.where(wide > 0, (rest - low) / np.where(wide > 0, wide, 1.0), 0.5)
+        share = np.where(wide > 0, (rest - low) / np.where(wide > 0, wide, 1.0), ~onwards)
         share = np.clip(share, 0.0, 1.0)
-        first, second = self.states
         mixed: Array = first + share * (second - first)
         return mixed
 

@@ -21,7 +21,7 @@ from ruckig import (
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.motion.motion_bounds import ENDLESS
 
-__all__ = ["first_part", "rest_positions", "stopping_range"]
+__all__ = ["braked_part", "first_part", "rest_positions", "stopping_range"]
 
 
 def first_part(start: Array, target: Array, drift: Array, dt: Array, limits: Array) -> Array:
@@ -83,6 +83,25 @@ def stopping_range(start: Array, acceleration: Array, jerk: Array) -> tuple[Arra
     return low, high
 
 
+def braked_part(start: Array, dt: Array, acceleration: Array, jerk: Array) -> Array | None:
+    """The state after ``dt`` of motions that stop as soon as they can; None without a plan.
+
+    Parameters
+    ----------
+    start : ndarray of shape (3, N)
+    dt : ndarray of shape (N,)
+        Durations [s].
+    acceleration, jerk : ndarray of shape (N,)
+        Bounds; they may be infinite.
+
+    Returns
+    -------
+    ndarray of shape (3, N), or None
+    """
+    plan = _stop(start, acceleration, jerk)
+    return None if plan is None else _at(plan, dt)
+
+
 def rest_positions(start: Array, acceleration: Array, jerk: Array) -> Array:
     """Where motions come to rest that stop as soon as they can.
 
@@ -126,11 +145,7 @@ def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array
     asked.min_velocity = (-speed - drift).tolist()
     plan = _plan(asked)
     if plan is not None:
-        found = np.empty_like(start)
-        for duration in np.unique(dt):
-            then = dt == duration
-            found[:, then] = np.array(plan.at_time(float(duration)))[:, then]
-        return found + np.stack((drift * dt, drift, np.zeros_like(drift)))
+        return _at(plan, dt) + np.stack((drift * dt, drift, np.zeros_like(drift)))
     if len(target) > 1:  # one motion that cannot be planned fails all
         singles = (
             _planned(start[:, [i]], target[[i]], drift[[i]], dt[[i]], limits[:, [i]])
@@ -140,6 +155,15 @@ def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array
     change = np.clip(-start[1] / dt, -acceleration, acceleration)  # it loses speed
     moved = start[0] + start[1] * dt + change * (dt * dt / 2)
     return np.stack((moved, start[1] + change * dt, np.zeros_like(change)))
+
+
+def _at(plan: Trajectory, dt: Array) -> Array:
+    """States (3, N) of planned motions after durations (N,)."""
+    found = np.empty((3, len(dt)))
+    for duration in np.unique(dt):
+        then = dt == duration
+        found[:, then] = np.array(plan.at_time(float(duration)))[:, then]
+    return found
 
 
 def _input(start: Array) -> InputParameter:

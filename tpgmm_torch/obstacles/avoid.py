@@ -9,9 +9,9 @@ come to rest if it braked after this tick, and so where it is then
               + |x - e|^2 / Q^2 + |x - r|^2 / C^2
     such that n^T J x >= -(d - d_min) / 2,   n^T J x' >= -(d - d_min)   and   r_0 <= x <= r_1,
 
-where e are the ways to where the ordinary reference would come to rest, r is its own way to
-there, x' is the way of this tick, which x decides, and distances d and their derivatives n^T J
-are those at the last reference. Half of the room is for braking, as nearest points jump from
+where e are the ways to where the ordinary reference would come to rest, r are those by which the
+sent one stays as far from it as it is, x' is the way of this tick, which x decides (B1), and
+distances d and their derivatives n^T J are those at the last reference. Half of the room is for braking, as nearest points jump from
 edge to edge. Rows give way, as little as can be, only where nothing else is possible.
 
 The skill knows nothing of it: the ordinary reference goes on beside the one that is sent, and a
@@ -43,9 +43,11 @@ from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["Avoidance"]
 
-#: How exactly hands are led [m, rad], and joints, which are free to give way, and whose ways
-#: to rest are rather as long as ordinary ones: nothing trembles beside an edge [rad or m].
-HAND, TURN, JOINT, CALM = 0.005, 0.05, 0.5, 0.05
+#: How exactly hands are led [m, rad], and joints, which are free to give way.
+HAND, TURN, JOINT = 0.005, 0.05, 0.5
+#: How much joints change their way around in a tick [rad or m]: less where the ordinary
+#: reference is slower than this [rad/s or m/s], so that a robot that is blocked stands.
+CALM, STANDING, SLOW = 0.05, 0.01, 1e-3
 #: Share of the room to an obstacle that is used up before a robot could stand still.
 SHARE = 0.5
 #: Speed at which a robot leaves what it is too near to [m/s].
@@ -171,7 +173,7 @@ class Avoidance:
             Robots that come to rest, and robots for which no time has passed.
         """
         before, shape = self.sent or last, ordinary.reference.shape
-        tick = _Tick.of(self.scene, before, ordinary, state, frames)
+        tick = _Tick.of(self.scene, before, last, ordinary, state, frames)
         after, joins = self._joined(before, ordinary)
         ways = np.stack((after.moment.motion[0], rest(after))).reshape(2, *tick.here.shape)
         near, rows = tick.near(np.abs(ways - tick.here).max(0))
@@ -225,8 +227,8 @@ class _Tick:
     Parameters
     ----------
     scene : Scene
-    before, ordinary : Follower
-        What was sent last, and what would be sent now without obstacles.
+    before, last, ordinary : Follower
+        What was sent last, and what would be sent without obstacles, last and now.
     here : ndarray of shape (B, n_joints)
         The last references.
     placed : Placed
@@ -235,6 +237,7 @@ class _Tick:
 
     scene: Scene
     before: Follower
+    last: Follower
     ordinary: Follower
     here: Array
     placed: Placed
@@ -244,6 +247,7 @@ class _Tick:
         cls,
         scene: Scene,
         before: Follower,
+        last: Follower,
         ordinary: Follower,
         state: RobotState | None,
         frames: Mapping[str, Frame],
@@ -251,7 +255,8 @@ class _Tick:
         postures = before.reference.detach().reshape(-1, before.reference.shape[-1])
         objects = scene.objects(state, frames, len(postures))
         placed = scene.geometry.place(postures, objects)
-        return cls(scene, before, ordinary, as_array(postures).astype(np.float64), placed)
+        here = as_array(postures).astype(np.float64)
+        return cls(scene, before, last, ordinary, here, placed)
 
     def near(self, moved: Array) -> tuple[Near, Array]:
         """Pairs that could come too near where joints move by so much (B, n_joints), and rows.
@@ -278,27 +283,29 @@ class _Tick:
         """Motions (3, N, n_joints) of N robots; what is in their way goes into the pairs."""
         shape, here = self.here.shape, self.here
         braking = Braking.of(self.before, self.ordinary)
-        low, high = braking.rests.reshape(2, *shape) - here
-        first, second = braking.states[:, 0].reshape(2, *shape) - here
+        low, stop, high = braking.rests.reshape(3, *shape) - here
+        first, braked, second = braking.states[:, 0].reshape(3, *shape) - here
         wide = high - low
         slope = np.where(wide > 0, (second - first) / np.where(wide > 0, wide, 1.0), 0.0)
         reach = np.maximum(np.abs(low), np.abs(high))
         near, rows = self.near(np.where(robots[:, None], reach, -1.0))
         least, goal = self.least(near), rest(self.ordinary).reshape(shape)
-        onwards = goal - self.ordinary.moment.motion[0].reshape(shape)
+        as_far = (rest(self.before) - rest(self.last)).reshape(shape) + goal - here
+        speed = np.abs(self.ordinary.moment.motion[1].reshape(shape)).max(1)
+        calm = np.where(speed < SLOW, STANDING, CALM) ** -2
         ends, chosen = (torch.from_numpy(here), torch.from_numpy(goal)), here.copy()
         for row, (jacobian, error) in zip(
             np.flatnonzero(robots).tolist(), self.hands(*ends, robots), strict=True
         ):
             own = near.robot == row
             own &= np.minimum(rows * low[row], rows * high[row]).sum(1) < least.max(0)
-            # the way of this tick is linear in the way to rest
-            start = rows[own] @ (first[row] - slope[row] * low[row])
+            # the way of this tick is about linear in the way to rest, and exact where it brakes
+            start = rows[own] @ (braked[row] - slope[row] * stop[row])
             way, weights = _nearest(
-                jacobian.T @ jacobian + np.eye(shape[1]) * (1 / JOINT**2 + 1 / CALM**2),
+                jacobian.T @ jacobian + np.eye(shape[1]) * (1 / JOINT**2 + calm[row]),
                 jacobian.T @ error
                 + (goal[row] - here[row]) / JOINT**2
-                + onwards[row] / CALM**2,
+                + as_far[row] * calm[row],
                 np.concatenate((rows[own] * slope[row], rows[own])),
                 np.concatenate((least[0, own] - start, least[1, own])),
                 (low[row], high[row]),

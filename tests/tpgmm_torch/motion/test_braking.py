@@ -24,8 +24,8 @@ def test_any_choice_of_rest_keeps_all_bounds_for_ever(dt):
     for _ in range(300):
         after = follower.advance(torch.from_numpy(rng.uniform(-1, 1, N)), dt)
         braking = Braking.of(follower, after)
-        low, high = braking.rests
-        assert (low <= high).all()
+        low, _, high = braking.rests
+        assert (np.diff(braking.rests, axis=0) >= 0).all()
         # ends as often as what lies between
         share = np.clip(rng.uniform(-0.5, 1.5, N), 0, 1)
         state = braking.state(low + share * (high - low))
@@ -43,12 +43,27 @@ def test_a_place_of_rest_that_was_chosen_can_be_chosen_at_the_next_tick():
     rng, follower = np.random.default_rng(1), Follower.at(bounds(), torch.zeros(N))
     for _ in range(100):
         after = follower.advance(torch.from_numpy(rng.uniform(-1, 1, N)), 0.04)
-        low, high = Braking.of(follower, after).rests
+        low, _, high = Braking.of(follower, after).rests
         chosen = low + rng.uniform(0, 1, N) * (high - low)
         state = Braking.of(follower, after).state(chosen)
         follower = after.redirected(follower, state, np.array(True))
-        low, high = Braking.of(follower, after).rests
+        low, _, high = Braking.of(follower, after).rests
         assert (low - 1e-3 <= chosen).all() and (chosen <= high + 1e-3).all()
+
+
+@pytest.mark.parametrize("dt", [0.04, 0.01])
+def test_joints_that_are_asked_to_rest_where_they_would_come_to_rest_and_stay(dt):
+    follower = Follower.at(bounds(), torch.zeros(N))
+    for _ in range(9):
+        follower = follower.advance(torch.linspace(-1, 1, N), dt)
+    chosen = rest(follower)
+    assert np.abs(chosen - follower.reference.numpy()).max() > 0.01  # they are on their way
+    for _ in range(round(1 / dt)):
+        after = follower.advance(torch.linspace(-1, 1, N), dt)
+        state = Braking.of(follower, after).state(chosen)
+        follower = after.redirected(follower, state, np.array(True))
+    np.testing.assert_allclose(follower.moment.motion[0], chosen, atol=1e-6)
+    np.testing.assert_allclose(follower.moment.motion[1:], 0, atol=1e-6)
 
 
 def test_some_robots_are_redirected_and_the_others_are_as_they_were():

@@ -9,9 +9,9 @@ import torch
 from tests.support.skills import few_bottles, small_bottle
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import Controller, Frame
+from tpgmm_torch import Controller, Frame, Hold
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.obstacles import Scene, Shape
+from tpgmm_torch.obstacles import Scene, Shape, find_contacts
 from tpgmm_torch.sensing.trust import Trust
 
 DT = 0.04
@@ -99,7 +99,7 @@ def test_robots_of_a_batch_do_not_influence_each_other():
 def test_a_robot_that_cannot_go_on_waits_and_says_for_what():
     wall = Shape.box("wall", [0.12, 0.3, 0.3], [0.3, 0.0, 0.18])  # around the bottle
     running = controller(wall, clock="waiting:arrivals=4")
-    references, commands = run(running, 5.5)
+    references, commands = run(running, 8.0)
     assert commands[90].reason().startswith("kept ")  # it is off, and goes on
     assert commands[90].status == "running"
     assert commands[-1].status == "waiting"
@@ -114,7 +114,8 @@ def test_a_robot_that_cannot_go_on_waits_and_says_for_what():
         if "wall" in pair
     ]
     assert min(touched) > 0
-    assert float((references[-1] - references[-2]).abs().max()) < 0.03
+    # it stands, nearly: it does not tremble between the faces of the wall
+    assert float(references[-50:].diff(n=2, dim=0).abs().max()) < 0.005
 
 
 def test_what_a_hand_holds_is_part_of_it():
@@ -123,25 +124,30 @@ def test_what_a_hand_holds_is_part_of_it():
     begin = free()[12]
     hand = skill.kinematics.state(begin).pose("l_hand")
     pose = Frame(hand.position - torch.tensor([0.0, 0.0, 0.25]))
-    way = skill.kinematics.state(free()[-1]).position("l_hand") - hand.position
-    ball = Shape.sphere("ball", 0.03, pose.position + 0.7 * way)
+    later = skill.kinematics.state(free()[60]).pose("l_hand").compose(pose.seen_from(hand))
+    ball = Shape.sphere("ball", 0.04, later.position)
     allowed = [
         ("bottle", link) for link in ("l_hand", "r_hand", "l_wrist_1", "l_wrist_2", "l_forearm")
     ]
     scene = among(bottle, ball, allowed=allowed)
-    least = {}
-    for held in ("l_hand", None):
+    contacts = {}
+    for around in (None, scene):
         running = Controller(
-            skill, begin, {"bottle": pose}, begin=0.5, clock="even", trust=None, obstacles=scene
+            skill,
+            begin,
+            {"bottle": pose},
+            begin=0.5,
+            clock="even",
+            trust=None,
+            obstacles=around,
         )
-        found = []
-        for _ in range(100):
-            running.step(DT, holds={"bottle": held})
-            state = running.holding.state(skill.kinematics.state(running.reference[None]))
-            near = scene.distances(running.reference[None], running.holding.frames, 0.2, state)
-            found.append(float(near.get(("ball", "bottle"), np.ones(1))[0]))
-        least[held] = min(found)
-    assert least["l_hand"] > 0.004
+        references, _ = run(running, 2.5, holds={"bottle": "l_hand"})
+        time = DT * np.arange(len(references))
+        held = [Hold("bottle", "l_hand", 0.0, 9.0)]
+        found = find_contacts(scene, time, references, {"bottle": pose}, held)
+        contacts[around] = [x.depth for x in found if {x.one, x.other} == {"ball", "bottle"}]
+    assert max(contacts[None]) > 0.01
+    assert contacts[scene] == []
     assert one.frames.keys() == {"bottle"}
 
 
