@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,6 @@ from tpgmm_torch import (
     Demonstration,
     Frame,
     Hold,
-    Situation,
     TaskParameterizedGMM,
     ViaPoints,
 )
@@ -73,9 +73,7 @@ class Drawn:
 
     kind: str
     skill: Any
-    situation: Situation
     scene: Scene
-    bare: Scene
     end: float
     begin: float | None = None
     joints: Tensor | None = None
@@ -150,7 +148,7 @@ def _drawn(number: int, rng: np.random.Generator) -> Drawn:
     solids += [bottle] * carried
     scene = Scene(robot, solids, visuals=True, allowed=TOUCH if carried else ())
     return Drawn(
-        kind, skill, situation, scene.allowing(demonstrations), scene,
+        kind, skill, scene.allowing(demonstrations),
         brought if carried else closed + 0.5, begin, joints, frames,
     )  # fmt: skip
 
@@ -213,32 +211,29 @@ def examined(number: int, dt: float) -> dict[str, Any]:
     part = one.begin, one.end
     bare = _run(*given, None, dt, part, one.held)
     kept = _run(*given, one.scene, dt, part, one.held, stop=one.end - 0.5)
-    hands = [
-        one.skill.kinematics.state(run["references"][-1]).positions for run in (bare, kept)
-    ]
+    states = [one.skill.kinematics.state(run["references"][-1]) for run in (bare, kept)]
+    off = (states[0].positions - states[1].positions).norm(dim=-1).max()
     goal = _distances(one, bare["references"])
     needed = dict(zip(one.scene.pairs, one.scene.needed, strict=True))
     turns = kept["references"].diff(n=2, dim=0).abs().max(1).values
     waiting = np.array([status == "waiting" for _, status, _ in kept["reasons"]][2:])
+    calm = turns[waiting][-round(2 / dt) :].median() if waiting[-10:].all() else None
     bounds, shares = kept["bounds"], []
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         speed = kept["references"].diff(n=order, dim=0) / dt**order
         shares.append(float((speed.abs() / getattr(bounds, name)).max()))
-    deepest = {
-        name: _deepest(one, run["references"]) for name, run in (("bare", bare), ("kept", kept))
-    }
-    return {
-        "number": number, "kind": one.kind, "dt": dt,
-        "bare_mm": 1e3 * deepest["bare"][0], "bare_pair": deepest["bare"][1],
-        "kept_mm": 1e3 * deepest["kept"][0], "kept_pair": deepest["kept"][1],
+    found = {"number": number, "kind": one.kind, "dt": dt, "bounds": max(shares)}
+    for name, run in (("bare", bare), ("kept", kept)):
+        distance, found[f"{name}_pair"] = _deepest(one, run["references"])
+        found[f"{name}_mm"] = 1e3 * distance
+        found[f"{name}_ms"] = 1e3 * float(np.median(run["ticks"]))
+    return found | {
         "finished": kept["finished"],
-        "off_mm": 1e3 * float((hands[0] - hands[1]).norm(dim=-1).max()),
+        "off_mm": 1e3 * float(off),
         "possible": all(values[-1] >= needed[pair] for pair, values in goal.items()),
         "reason": kept["reasons"][-1][2] or "",
-        "trembles": float(turns[waiting][-round(2 / dt):].median()) if waiting[-10:].all() else None,
-        "bounds": max(shares),
-        "ms": 1e3 * float(np.median(kept["ticks"])), "ms_bare": 1e3 * float(np.median(bare["ticks"])),
-    }  # fmt: skip
+        "trembles": None if calm is None else float(calm),
+    }
 
 
 def _interval(found: int, of: int) -> str:
@@ -247,26 +242,31 @@ def _interval(found: int, of: int) -> str:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """A line for each kind and rate, and all."""
-    for dt in sorted({row["dt"] for row in rows}, reverse=True):
-        for kind in (*KINDS, "all"):
-            some = [r for r in rows if r["dt"] == dt and kind in (r["kind"], "all")]
-            hit = [r for r in some if r["bare_mm"] < 0]
-            possible = [r for r in hit if r["possible"]]
-            there = [r for r in possible if r["finished"] and r["off_mm"] <= 1e3 * THERE]
-            stuck = [r for r in hit if not r["finished"]]
-            calm = [r["trembles"] for r in some if r["trembles"] is not None]
-            yield (
-                f"{1 / dt:3.0f} Hz {kind:8} penetrate: {len(hit)} of {len(some)} without, "
-                f"{sum(r['kept_mm'] < 0 for r in some)} with "
-                f"(least {min((r['kept_mm'] for r in some), default=np.nan):.1f} mm); within "
-                f"10 mm where possible {_interval(len(there), len(possible))}; held {len(stuck)}, "
-                f"{sum(not r['reason'] for r in stuck)} of them without a reason; "
-                f"tremble {np.median(calm) if calm else 0:.4f}, at most {max(calm, default=0):.4f} "
-                f"rad; bounds {max((r['bounds'] for r in some), default=np.nan):.4f}; "
-                f"{np.median([r['ms'] for r in some] or [0]):.2f} ms a tick "
-                f"({np.median([r['ms_bare'] for r in some] or [0]):.2f} without)"
-            )
+    """Some lines for each rate and kind, and all kinds."""
+    for dt, kind in product(sorted({row["dt"] for row in rows}), (*KINDS, "all")):
+        some = [r for r in rows if r["dt"] == dt and kind in (r["kind"], "all")]
+        if not some:
+            continue
+        possible = [r for r in some if r["possible"]]
+        there = [r for r in possible if r["finished"] and r["off_mm"] <= 1e3 * THERE]
+        held = [r for r in some if not r["finished"]]
+        calm = [r["trembles"] for r in held if r["trembles"] is not None] or [0.0]
+        of = {key: [r[key] for r in some] for key in ("bare_mm", "kept_mm", "bounds")}
+        ticks = [np.median([r[key] for r in some]) for key in ("bare_ms", "kept_ms")]
+        yield f"{1 / dt:.0f} Hz, {kind}, {len(some)} scenes"
+        yield (
+            f"  penetrate: {sum(x < 0 for x in of['bare_mm'])} without, "
+            f"{sum(x < 0 for x in of['kept_mm'])} with (least {min(of['kept_mm']):.1f} mm)"
+        )
+        yield f"  within 10 mm where possible: {_interval(len(there), len(possible))}"
+        yield (
+            f"  held: {len(held)}, {sum(not r['reason'] for r in held)} without a reason; "
+            f"second differences there {np.median(calm):.4f}, at most {max(calm):.4f} rad"
+        )
+        yield (
+            f"  bounds used: {max(of['bounds']):.4f}; a tick {ticks[0]:.2f} ms without, "
+            f"{ticks[1]:.2f} with"
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.obstacle_scenes import KINDS, examined, summary
 from benchmarks.points import BLOCKS, Problem, motions
 from benchmarks.roofline import flops_of_iteration
 from benchmarks.rows import Asked, Omitted, Row, markdown
@@ -133,3 +134,12 @@ def test_sizes_and_rounds():
     assert (full.size(9, 2), full.rounds(5)) == (9, 5)
     assert (tiny.size(9, 2), tiny.rounds(5)) == (2, 1)
     assert Settings(False, Path(), repeat=4).rounds(5) == 4
+
+
+def test_scenes_in_the_way_are_drawn_and_references_keep_clear_of_them():
+    found = [examined(number, 0.04) for number in (KINDS.index("ball"), KINDS.index("carried"))]
+    for one in found:
+        assert one["bare_mm"] < 0 < one["kept_mm"]
+        assert one["bounds"] <= 1 + 1e-6
+        assert one["finished"] or one["reason"].startswith("blocked by ")
+    assert "2 without, 0 with" in "\n".join(summary(found))

@@ -223,8 +223,7 @@ class Controller:
         if trust is not None:
             grips = None if self._gripping is None else self._gripping.numpy(force=True)
             self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
-        solid = () if obstacles is None else obstacles.geometry.objects
-        self._holds = Holds.start(skill, self._frames, solid)
+        self._holds = Holds.start(skill, self._frames)
         begin, end = _span(skill, begin, end)
         self._wrenches = _expected_contacts(skill, start, begin)
         forces = self._wrenches.thresholds
@@ -237,6 +236,7 @@ class Controller:
         self._avoidance, batch = None, len(self._progress.time)
         if obstacles is not None:
             self._avoidance = Avoidance.start(obstacles, kinematics, bounds, batch)
+            self._holds = self._holds.of_solids(obstacles.geometry.objects)
         self._limits = _limits(bounds)
         self.command: Command | None = None
 

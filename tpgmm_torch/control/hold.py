@@ -255,16 +255,18 @@ class Holds:
     hidden: Mapping[str, Tensor] = MappingProxyType({})
 
     @classmethod
-    def start(
-        cls, skill: Skill, frames: Mapping[str, Frame], solid: Iterable[str] = ()
-    ) -> Self:
-        """Before anything is held, with poses of all objects; of some the solids matter."""
-        objects = tuple(dict.fromkeys((*skill.carried_names, *solid)))
-        holding = Holding.start(skill.kinematics, objects, skill.holds, frames)
+    def start(cls, skill: Skill, frames: Mapping[str, Frame]) -> Self:
+        """Before anything is held, with poses of all objects."""
+        holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, frames)
         first: dict[str, float] = {}
         for hold in holding.holds:
             first[hold.frame] = min(hold.begin, first.get(hold.frame, math.inf))
         return cls(holding, HoldWatch(skill.kinematics), first)
+
+    def of_solids(self, names: Iterable[str]) -> Self:
+        """The holds, where these objects are solids among obstacles."""
+        objects = tuple(dict.fromkeys((*self.holding.objects, *names)))
+        return replace(self, holding=replace(self.holding, objects=objects))
 
     def advance(
         self,

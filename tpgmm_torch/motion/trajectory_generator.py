@@ -119,8 +119,7 @@ def rest_positions(start: Array, acceleration: Array, jerk: Array) -> Array:
     plan = _stop(start, acceleration, jerk)
     if plan is None:
         return start[0]
-    found: Array = np.array(plan.at_time(plan.duration)[0])
-    return found
+    return np.array(plan.at_time(plan.duration)[0])
 
 
 def _stop(start: Array, acceleration: Array, jerk: Array) -> Trajectory | None:

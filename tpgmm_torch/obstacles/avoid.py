@@ -9,10 +9,11 @@ come to rest if it braked after this tick, and so where it is then
               + |x - e|^2 / Q^2 + |x - r|^2 / C^2
     such that n^T J x >= -(d - d_min) / 2,   n^T J x' >= -(d - d_min)   and   r_0 <= x <= r_1,
 
-where e are the ways to where the ordinary reference would come to rest, r are those by which the
-sent one stays as far from it as it is, x' is the way of this tick, which x decides (B1), and
-distances d and their derivatives n^T J are those at the last reference. Half of the room is for braking, as nearest points jump from
-edge to edge. Rows give way, as little as can be, only where nothing else is possible.
+where e are the ways to where the ordinary reference would come to rest, r are those by which
+the sent one stays as far from it as it is, x' is the way of this tick, which x decides (B1),
+and distances d and their derivatives n^T J are those at the last reference. Half of the room is
+for braking, as nearest points jump from edge to edge. Rows give way, as little as can be, only
+where nothing else is possible.
 
 The skill knows nothing of it: the ordinary reference goes on beside the one that is sent, and a
 led robot joins it as soon as the bounds of motion let it. Nothing plans: a robot that cannot go
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import daqp
@@ -151,14 +153,9 @@ class Avoidance:
         return found
 
     def advance(
-        self,
-        last: Follower,
-        ordinary: Follower,
-        state: RobotState | None,
-        frames: Mapping[str, Frame],
-        halted: Mask,
-        late: Mask,
-    ) -> Self:
+        self, last: Follower, ordinary: Follower, state: RobotState | None,
+        frames: Mapping[str, Frame], halted: Mask, late: Mask,
+    ) -> Self:  # fmt: skip
         """The references that are sent after a tick.
 
         Parameters
@@ -176,7 +173,10 @@ class Avoidance:
         tick = _Tick.of(self.scene, before, last, ordinary, state, frames)
         after, joins = self._joined(before, ordinary)
         ways = np.stack((after.moment.motion[0], rest(after))).reshape(2, *tick.here.shape)
-        near, rows = tick.near(np.abs(ways - tick.here).max(0))
+        moved = np.abs(ways - tick.here).max(0)
+        if self.led.any():  # they are led again, most often
+            moved = np.maximum(moved, np.where(self.led[:, None], tick.reach, 0.0))
+        near, rows = tick.near(moved)
         kept = np.einsum("nj,knj->kn", rows, (ways - tick.here)[:, near.robot])
         bad = self.led & ~joins
         bad[near.robot[(kept < tick.least(near) - ROUNDING).any(0)]] = True
@@ -185,17 +185,17 @@ class Avoidance:
             return self
         pairs = list(self.pairs)
         if bad.any():
+            if (bad & ~self.led).any():
+                near, rows = tick.near(np.where(bad[:, None], tick.reach, -1.0))
             motion = after.moment.motion.copy()
-            motion.reshape(3, *tick.here.shape)[:, bad] = tick.solved(bad, pairs)
+            motion.reshape(3, *tick.here.shape)[:, bad] = tick.solved(bad, near, rows, pairs)
             after = after.redirected(before, motion, bad.reshape(shape[:-1]))
         after = _still(after, before, halted & self.led, late)
         apart = (after.moment.motion != ordinary.moment.motion).any(0).any(-1).reshape(-1)
         led = (self.led | bad) & apart
         lead = np.zeros(len(led))
         if led.any():
-            one, other = (
-                x.reference.detach().reshape(tick.here.shape) for x in (after, ordinary)
-            )
+            one, other = (x.reference.reshape(tick.here.shape) for x in (after, ordinary))
             lead[led] = [_lead(error) for _, error in tick.hands(one, other, led)]
         sent = after if led.any() else None
         return replace(self, led=led, lead=lead, pairs=tuple(pairs), sent=sent)
@@ -244,14 +244,9 @@ class _Tick:
 
     @classmethod
     def of(
-        cls,
-        scene: Scene,
-        before: Follower,
-        last: Follower,
-        ordinary: Follower,
-        state: RobotState | None,
-        frames: Mapping[str, Frame],
-    ) -> Self:
+        cls, scene: Scene, before: Follower, last: Follower, ordinary: Follower,
+        state: RobotState | None, frames: Mapping[str, Frame],
+    ) -> Self:  # fmt: skip
         postures = before.reference.detach().reshape(-1, before.reference.shape[-1])
         objects = scene.objects(state, frames, len(postures))
         placed = scene.geometry.place(postures, objects)
@@ -279,16 +274,23 @@ class _Tick:
         leaving = np.minimum(-room, LEAVING * dt)
         return np.stack((-np.maximum(room, 0.0), np.where(room < 0, leaving, -SHARE * room)))
 
-    def solved(self, robots: Mask, pairs: list[str]) -> Array:
+    @cached_property
+    def braking(self) -> Braking:
+        """Where the robots can be after the tick."""
+        return Braking.of(self.before, self.ordinary)
+
+    @property
+    def reach(self) -> Array:
+        """How far joints can get at most (B, n_joints)."""
+        return np.abs(self.braking.rests.reshape(3, *self.here.shape) - self.here).max(0)
+
+    def solved(self, robots: Mask, near: Near, rows: Array, pairs: list[str]) -> Array:
         """Motions (3, N, n_joints) of N robots; what is in their way goes into the pairs."""
-        shape, here = self.here.shape, self.here
-        braking = Braking.of(self.before, self.ordinary)
+        shape, here, braking = self.here.shape, self.here, self.braking
         low, stop, high = braking.rests.reshape(3, *shape) - here
         first, braked, second = braking.states[:, 0].reshape(3, *shape) - here
         wide = high - low
         slope = np.where(wide > 0, (second - first) / np.where(wide > 0, wide, 1.0), 0.0)
-        reach = np.maximum(np.abs(low), np.abs(high))
-        near, rows = self.near(np.where(robots[:, None], reach, -1.0))
         least, goal = self.least(near), rest(self.ordinary).reshape(shape)
         as_far = (rest(self.before) - rest(self.last)).reshape(shape) + goal - here
         speed = np.abs(self.ordinary.moment.motion[1].reshape(shape)).max(1)
@@ -301,11 +303,10 @@ class _Tick:
             own &= np.minimum(rows * low[row], rows * high[row]).sum(1) < least.max(0)
             # the way of this tick is about linear in the way to rest, and exact where it brakes
             start = rows[own] @ (braked[row] - slope[row] * stop[row])
+            posture = (goal[row] - here[row]) / JOINT**2 + as_far[row] * calm[row]
             way, weights = _nearest(
                 jacobian.T @ jacobian + np.eye(shape[1]) * (1 / JOINT**2 + calm[row]),
-                jacobian.T @ error
-                + (goal[row] - here[row]) / JOINT**2
-                + as_far[row] * calm[row],
+                jacobian.T @ error + posture,
                 np.concatenate((rows[own] * slope[row], rows[own])),
                 np.concatenate((least[0, own] - start, least[1, own])),
                 (low[row], high[row]),
@@ -314,9 +315,8 @@ class _Tick:
             if weights.any():
                 at = near.pair[own][int(weights.reshape(2, -1).max(0).argmax())]
                 pairs[row] = self.scene.label(int(at))
-        return braking.state(chosen.reshape(braking.rests.shape[1:])).reshape(3, *shape)[
-            :, robots
-        ]
+        motion = braking.state(chosen.reshape(braking.rests.shape[1:]))
+        return motion.reshape(3, *shape)[:, robots]
 
     def hands(
         self, postures: Tensor, ends: Tensor, robots: Mask
@@ -324,12 +324,12 @@ class _Tick:
         """Jacobian of the hands of some robots, and their ways to the ends, in units."""
         where = torch.from_numpy(robots)
         with torch.inference_mode():
-            now, then = (self.scene.robot.state(x[where]) for x in (postures, ends))
-            back = quaternions.conjugate(now.orientations)
-            turns = quaternions.log(quaternions.product(then.orientations, back))
+            state = self.scene.robot.state(torch.stack((postures[where], ends[where])))
+            back = quaternions.conjugate(state.orientations[0])
+            turns = quaternions.log(quaternions.product(state.orientations[1], back))
             unit = turns.new_tensor([HAND] * 3 + [TURN] * 3)
-            error = torch.cat((then.positions - now.positions, turns), -1) / unit
-            jacobians = now.jacobians / unit[:, None]
+            error = torch.cat((state.positions.diff(dim=0)[0], turns), -1) / unit
+            jacobians = state.jacobians[0] / unit[:, None]
         each = jacobians.flatten(1, 2).double(), error.flatten(1).double()
         return zip(*(x.numpy(force=True) for x in each), strict=True)
 
