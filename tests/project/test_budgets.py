@@ -57,7 +57,7 @@ CEILINGS = {
     "lines of tpgmm_tools": 3475,
     "lines of tpgmm_vision": 2845,
     "lines of environments and evaluation": 10545,
-    "lines of tests of core, data sets, policy and tools": 21190,
+    "lines of tests of core, data sets, policy and tools": 21200,
     "longest function of the core": 81,
     "named numeric constants of the core": 156,
 }

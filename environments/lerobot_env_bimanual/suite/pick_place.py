@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import ClassVar
 
+import mujoco
 import numpy as np
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
@@ -29,8 +31,10 @@ from lerobot_env_bimanual.suite.task import Box, Judge, Leg, Pose, Style, raised
 from tpgmm_torch import Canonical, Demonstration, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["PickPlace", "Placing"]
+__all__ = ["SHELF", "PickPlace", "Placing", "Shelf"]
 
+#: The shelf of the task ``shelf``, for the environment and for ``--policy.obstacles``.
+SHELF = Path(__file__).with_name("shelf.xml")
 #: Where stands are, in the reach of the left hand [m].
 STANDS = (0.25, -0.04), (0.32, 0.0)
 #: How high the baton is lifted [m].
@@ -132,3 +136,39 @@ class Placing(Judge):
         home = hand - (hand if self.first is None else self.first)
         placed = {**on_stand(scene), "put": float(self.put)}
         return {**placed, "home_mm": 1e3 * float(np.linalg.norm(home[:3]))}
+
+
+class Shelf(PickPlace):
+    """Take a baton and put it on a stand, clear of a shelf."""
+
+    name = "shelf"
+    description = f"{PickPlace.description}, clear of the shelf"
+    figures: ClassVar = {
+        **PickPlace.figures,
+        "inside_mm": Figure("inside the shelf [mm]", 1, high=0.0),
+    }
+
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """Baton, stand and shelf, with which nothing collides."""
+        super().furnish(spec)
+        shelf = mujoco.MjSpec.from_file(str(SHELF))
+        for geom in shelf.geoms:
+            geom.contype = geom.conaffinity = 0
+        spec.attach(shelf, prefix="a ", frame=spec.worldbody.add_frame())
+
+    def judge(self) -> Judge:
+        """As of ``pick_place``; it keeps how deep anything was in the shelf."""
+        return _Clear()
+
+
+class _Clear(Placing):
+    def __init__(self) -> None:
+        super().__init__()
+        self.inside = 0.0
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        super().note(scene, seconds)
+        self.inside = max(self.inside, scene.depth("a shelf"))
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        return {**super().figures(scene), "inside_mm": 1e3 * self.inside}

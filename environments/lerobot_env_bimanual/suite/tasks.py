@@ -8,10 +8,9 @@ from lerobot_env_bimanual.suite.handover import Handover
 from lerobot_env_bimanual.suite.lid import Lid
 from lerobot_env_bimanual.suite.names import UPPER_BODY
 from lerobot_env_bimanual.suite.peg_in_hole import PegInHole
-from lerobot_env_bimanual.suite.pick_place import PickPlace
+from lerobot_env_bimanual.suite.pick_place import PickPlace, Shelf
 from lerobot_env_bimanual.suite.pour import Pour
 from lerobot_env_bimanual.suite.robots.embodiments import embodiment
-from lerobot_env_bimanual.suite.shelf import Shelf
 from lerobot_env_bimanual.suite.task import SuiteTask
 from lerobot_env_bimanual.suite.wipe import Wipe
 from tpgmm_torch.exceptions import UnknownNameError

@@ -14,7 +14,10 @@ from lerobot_env_bimanual.rendering import offscreen
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import TagDetector
 
-pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here"),
+]
 
 TAGS = {"r_hand": cube_at(40, y=0.04)}
 

@@ -7,7 +7,7 @@ from lerobot.envs import preprocess_observation
 
 from lerobot_env_bimanual.record import expert
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.shelf import SHELF
+from lerobot_env_bimanual.suite.pick_place import SHELF
 from lerobot_env_bimanual.suite.tasks import suite_task
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_torch import TaskParameterizedGMM

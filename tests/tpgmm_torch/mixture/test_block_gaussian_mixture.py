@@ -122,6 +122,15 @@ def test_one_block_equals_scikit_learn(clusters, start, covariance_type, n_iter)
     assert model.n_iter_ == reference.n_iter_
 
 
+def test_rounding_never_takes_the_regularization_away():
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        data = rng.standard_normal((120, 1)) + 1e-3 * rng.standard_normal((120, 8))
+        model = fitted(BlockGaussianMixture(1, reg_covar=1e-4), data)
+        added = np.diagonal(model.covariances_[0][0].numpy()) / data.var(0) - 1
+        np.testing.assert_allclose(added, 1e-4, rtol=1e-6)
+
+
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
 def test_relative_regularization_follows_the_units(clusters, covariance_type):
     per_column = np.array([1e3, 1e3, 1e-4, 1e-4, 1e-4])

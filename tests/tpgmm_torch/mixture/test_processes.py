@@ -13,6 +13,8 @@ from tests.support import torchrun_worker as worker
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.processes import Processes, joined_processes
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 
 
