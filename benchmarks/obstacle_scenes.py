@@ -26,11 +26,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import binomtest
 from torch import Tensor
 
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
+from tpgmm_evaluation.report.tables import wilson
 from tpgmm_torch import (
     Controller,
     Demonstration,
@@ -93,7 +93,8 @@ def drawn(number: int) -> Drawn:
         run = _run(
             one.skill, one.joints, one.frames, None, 0.04, (one.begin, one.end), one.held
         )
-        if _deepest(one, run["references"][:1])[0] > 0 > _deepest(one, run["references"])[0]:
+        distances = _distances(one, run["references"]).values()
+        if all(d[0] > 0 for d in distances) and any((d < 0).any() for d in distances):
             return one
     raise RuntimeError(f"nothing is in the way in scene {number}")
 
@@ -178,12 +179,12 @@ def _run(
         command = running.step(dt, **holds)
         ticks.append(time.process_time() - began)
         sent.append(command.reference)
-        reasons.append((float(command.time), str(command.status), command.reason()))
+        reasons.append((str(command.status), command.reason()))
         if running.finished:
             break
     return {
         "references": torch.stack(sent), "reasons": reasons, "ticks": ticks,
-        "finished": running.finished, "bounds": skill.motion_bounds,
+        "finished": running.finished,
     }  # fmt: skip
 
 
@@ -196,10 +197,10 @@ def _distances(one: Drawn, references: Tensor) -> dict[tuple[str, str], Any]:
     return one.scene.distances(references, places, 0.05, state)
 
 
-def _deepest(one: Drawn, references: Tensor) -> tuple[float, str]:
+def _deepest(distances: Mapping[tuple[str, str], Any]) -> tuple[float, str]:
     """The least distance in a motion [m], and of which pair."""
-    found = _distances(one, references).items()
-    return min(((float(d.min()), " / ".join(p)) for p, d in found), default=(np.inf, ""))
+    every = ((float(d.min()), " / ".join(pair)) for pair, d in distances.items())
+    return min(every, default=(np.inf, ""))
 
 
 def examined(number: int, dt: float) -> dict[str, Any]:
@@ -213,31 +214,38 @@ def examined(number: int, dt: float) -> dict[str, Any]:
     kept = _run(*given, one.scene, dt, part, one.held, stop=one.end - 0.5)
     states = [one.skill.kinematics.state(run["references"][-1]) for run in (bare, kept)]
     off = (states[0].positions - states[1].positions).norm(dim=-1).max()
-    goal = _distances(one, bare["references"])
+    distances = {
+        name: _distances(one, run["references"])
+        for name, run in (("bare", bare), ("kept", kept))
+    }
     needed = dict(zip(one.scene.pairs, one.scene.needed, strict=True))
     turns = kept["references"].diff(n=2, dim=0).abs().max(1).values
-    waiting = np.array([status == "waiting" for _, status, _ in kept["reasons"]][2:])
+    waiting = np.array([status == "waiting" for status, _ in kept["reasons"]][2:])
     calm = turns[waiting][-round(2 / dt) :].median() if waiting[-10:].all() else None
-    bounds, shares = kept["bounds"], []
+    bounds, shares = one.skill.motion_bounds, []
     for order, name in enumerate(("velocity", "acceleration", "jerk"), 1):
         speed = kept["references"].diff(n=order, dim=0) / dt**order
         shares.append(float((speed.abs() / getattr(bounds, name)).max()))
     found = {"number": number, "kind": one.kind, "dt": dt, "bounds": max(shares)}
     for name, run in (("bare", bare), ("kept", kept)):
-        distance, found[f"{name}_pair"] = _deepest(one, run["references"])
+        distance, found[f"{name}_pair"] = _deepest(distances[name])
         found[f"{name}_mm"] = 1e3 * distance
         found[f"{name}_ms"] = 1e3 * float(np.median(run["ticks"]))
     return found | {
         "finished": kept["finished"],
         "off_mm": 1e3 * float(off),
-        "possible": all(values[-1] >= needed[pair] for pair, values in goal.items()),
-        "reason": kept["reasons"][-1][2] or "",
+        "possible": all(
+            values[-1] >= needed[pair] for pair, values in distances["bare"].items()
+        ),
+        "reason": kept["reasons"][-1][1] or "",
         "trembles": None if calm is None else float(calm),
     }
 
 
-def _interval(found: int, of: int) -> str:
-    low, high = binomtest(found, of).proportion_ci(method="wilson") if of else (0, 1)
+def _share(found: int, of: int) -> str:
+    if not of:
+        return "none"
+    low, high = wilson(found, of)
     return f"{found} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
@@ -258,7 +266,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             f"  penetrate: {sum(x < 0 for x in of['bare_mm'])} without, "
             f"{sum(x < 0 for x in of['kept_mm'])} with (least {min(of['kept_mm']):.1f} mm)"
         )
-        yield f"  within 10 mm where possible: {_interval(len(there), len(possible))}"
+        yield f"  within 10 mm where possible: {_share(len(there), len(possible))}"
         yield (
             f"  held: {len(held)}, {sum(not r['reason'] for r in held)} without a reason; "
             f"second differences there {np.median(calm):.4f}, at most {max(calm):.4f} rad"

@@ -56,7 +56,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("commands",),
     ),
     "tpgmm_tools": (
-        ("hub", "plotting"),
+        ("hub", "plotting", "contacts"),
         ("viewing",),
         ("report", "arguments"),
         ("cli",),

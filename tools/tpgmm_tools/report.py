@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from sklearn.base import clone
 
+from tpgmm_tools.contacts import contacts
 from tpgmm_tools.hub.model_card import sections
 from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
 from tpgmm_tools.viewing import write_motion
@@ -25,15 +26,14 @@ from tpgmm_torch.checks.summary import UNLIKELY
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
-from tpgmm_torch.obstacles import Contact, Scene, find_contacts
+from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.operators.base import of_joints
 
-__all__ = ["LeftOut", "contacts", "leave_one_out", "write_report"]
+__all__ = ["LeftOut", "leave_one_out", "write_report"]
 
 #: Joints whose candidates are drawn: those that move most.
 DRAWN = 4
@@ -332,29 +332,6 @@ def _obstacles(
     head = ["episode", "what", "touches", "from, to [s]", "by [mm]"]
     text = f"<p>{said}</p>{_table(head, rows) if rows else ''}"
     return [said], f"{text}<details><summary>pairs that may</summary>{_list(allowed)}</details>"
-
-
-def contacts(
-    scene: Scene,
-    motions: Iterable[Trajectory],
-    situations: Iterable[Situation],
-    holds: Sequence[Hold],
-) -> Iterator[tuple[int, Contact]]:
-    """What touches what in motions, each in its situation, with the motion's number.
-
-    Parameters
-    ----------
-    scene : Scene
-    motions : iterable of Trajectory
-    situations : iterable of Situation
-        As many.
-    holds : sequence of Hold
-        What the robot holds meanwhile.
-    """
-    for number, (one, situation) in enumerate(zip(motions, situations, strict=True)):
-        frames = situation.frames_at(one.time.cpu())
-        for contact in find_contacts(scene, one.time, one.joints, frames, holds):
-            yield number, contact
 
 
 def _demonstrations(left_out: Sequence[LeftOut]) -> str:

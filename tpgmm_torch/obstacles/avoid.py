@@ -292,7 +292,7 @@ class _Tick:
         wide = high - low
         slope = np.where(wide > 0, (second - first) / np.where(wide > 0, wide, 1.0), 0.0)
         least, goal = self.least(near), rest(self.ordinary).reshape(shape)
-        as_far = (rest(self.before) - rest(self.last)).reshape(shape) + goal - here
+        as_far = stop + goal - rest(self.last).reshape(shape)
         speed = np.abs(self.ordinary.moment.motion[1].reshape(shape)).max(1)
         calm = np.where(speed < SLOW, STANDING, CALM) ** -2
         ends, chosen = (torch.from_numpy(here), torch.from_numpy(goal)), here.copy()

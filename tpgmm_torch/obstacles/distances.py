@@ -162,11 +162,8 @@ class Geometry:
         within : ndarray of shape (B, P)
             How near counts [m].
         """
-        measure, model, data = (
-            mujoco_module("distances").mj_geomDistance,
-            self._model,
-            self._data,
-        )
+        measure = mujoco_module("distances").mj_geomDistance
+        model, data = self._model, self._data
         first, second = self.pairs.T
         away = placed.centres[:, first] - placed.centres[:, second]
         reach = np.maximum(within + self._radius[first] + self._radius[second], 0.0)

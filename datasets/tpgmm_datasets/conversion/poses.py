@@ -147,8 +147,10 @@ class FramePose:
         return Frame(position, self._orientation(rotation))
 
     def _orientation(self, rotation: torch.Tensor) -> torch.Tensor | None:
-        if self.rotation in (None, "wxyz"):
-            return rotation if self.rotation else None
+        if self.rotation is None:
+            return None
+        if self.rotation == "wxyz":
+            return rotation
         if self.rotation == "xyzw":
             return rotation.roll(1, dims=-1)
         angles = rotation.deg2rad() if self.degrees else rotation

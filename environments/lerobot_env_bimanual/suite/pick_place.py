@@ -31,7 +31,7 @@ from lerobot_env_bimanual.suite.task import Box, Judge, Leg, Pose, Style, raised
 from tpgmm_torch import Canonical, Demonstration, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["SHELF", "PickPlace", "Placing", "Shelf"]
+__all__ = ["SHELF", "PickPlace", "Shelf"]
 
 #: The shelf of the task ``shelf``, for the environment and for ``--policy.obstacles``.
 SHELF = Path(__file__).with_name("shelf.xml")
@@ -83,7 +83,7 @@ class PickPlace(Handover):
 
     def judge(self) -> Judge:
         """Opens the hand when the baton is down again."""
-        return Placing()
+        return _Judge()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """The hand seen from where the baton was and from the stand, what it holds; joints."""
@@ -108,9 +108,7 @@ class PickPlace(Handover):
         return found
 
 
-class Placing(Judge):
-    """Says where the baton was put, and where the hand is then."""
-
+class _Judge(Judge):
     def __init__(self) -> None:
         self.time = 0.0
         self.lifted = self.put = False
@@ -118,20 +116,17 @@ class Placing(Judge):
         self.opening = Closing(reach=PUT)
 
     def note(self, scene: SuiteScene, seconds: float) -> None:
-        """Keep where the hand began, and whether the baton is lifted."""
         self.first = scene.pose("l_hand") if self.first is None else self.first
         self.time += seconds
         self.lifted = LEFT in scene.held and (self.lifted or height(scene) > LIFTED)
 
     def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
-        """The left hand, when the baton is down again."""
         if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
             self.put = True
             return (LEFT,)
         return ()
 
     def figures(self, scene: SuiteScene) -> dict[str, float]:
-        """Where the baton stands, and how far the hand is from where it began."""
         hand = scene.pose("l_hand")
         home = hand - (hand if self.first is None else self.first)
         placed = {**on_stand(scene), "put": float(self.put)}
@@ -161,7 +156,7 @@ class Shelf(PickPlace):
         return _Clear()
 
 
-class _Clear(Placing):
+class _Clear(_Judge):
     def __init__(self) -> None:
         super().__init__()
         self.inside = 0.0

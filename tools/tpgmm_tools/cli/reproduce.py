@@ -111,7 +111,7 @@ def reproduce(
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
     if obstacles is not None:
-        from tpgmm_tools.report import contacts
+        from tpgmm_tools.contacts import contacts
 
         scene = options.scene(obstacles, skill, visuals, shown)
         found = list(contacts(scene, trajectories, wanted, skill.holds))
