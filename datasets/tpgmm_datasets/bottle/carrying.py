@@ -178,26 +178,19 @@ class CarryAndPut(BottleSkill):
         grasped, place = bottles.compose(slide(slides)), trays.compose(FOOT_ON_TRAY)
         ways = {"lift": _above(grasped), "carry": _above(place), "lower": place}
 
-        def bottle(time: Tensor, progress: Mapping[str, Tensor]) -> Frame:
-            slid = ((time - arrived - SLIDE[0]) / SLIDE[1]).clamp(0, 1)
-            pose = between(bottles, grasped, slid)
-            for phase, end in ways.items():
-                pose = between(pose, end, progress[phase])
-            return pose
-
-        def wanted(time: Tensor) -> list[Frame]:
-            progress = self._timing.progress(time, ends)
-            held, poses = before_sliding(bottle(time, progress), slides), []
-            for hand in HANDS:
-                away = attached(held, APPROACH_POINT[hand])
-                leaving = between(attached(held, GRASP_POINT[hand]), away, progress["leave"])
-                pose = reached(first[hand], hand, bottles, progress)
-                poses.append(either(progress["lift"] > 0, leaving, pose))
-            return poses
-
-        times, joints = self._follow(starts, wanted, ends)
-        each = times[:, None].expand(-1, len(starts))
-        path = Frame.stack([bottle(t, self._timing.progress(t, ends)) for t in each])
+        times = self._times(ends)
+        progress = self._timing.progress(times[:, None], ends)
+        slid = ((times[:, None] - arrived - SLIDE[0]) / SLIDE[1]).clamp(0, 1)
+        path = between(bottles, grasped, slid)
+        for phase, end in ways.items():
+            path = between(path, end, progress[phase])
+        held, wanted = before_sliding(path, slides), []
+        for hand in HANDS:
+            away = attached(held, APPROACH_POINT[hand])
+            leaving = between(attached(held, GRASP_POINT[hand]), away, progress["leave"])
+            pose = reached(first[hand], hand, bottles, progress)
+            wanted.append(either(progress["lift"] > 0, leaving, pose))
+        joints = self._follow(starts, wanted)
         return self._recorded(times, joints, ends, {"bottle": path, "tray": trays})
 
     def _events(self, end: Mapping[str, float]) -> dict[str, float]:

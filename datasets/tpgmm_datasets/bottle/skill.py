@@ -9,7 +9,7 @@ of both hands, which share the waist, along minimum-jerk paths.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import ClassVar
@@ -164,23 +164,25 @@ class BottleSkill:
     def _timing(self) -> Phases:
         return Phases(self.phases, self.rate, self.stretch)
 
-    def _follow(
-        self, starts: Tensor, wanted: Callable[[Tensor], list[Frame]], ends: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Times (T,), and joints (T, n, 17) of all demonstrations, by inverse kinematics."""
-        times = self._timing.times(max(self._timing.steps(ends)))
-        posture = self.neutral_posture()
-        return times, follow_hands(self.robot, starts, wanted, times, posture)
+    def _times(self, ends: Tensor) -> Tensor:
+        """The instants until the longest demonstration ends, shape (T,) [s]."""
+        return self._timing.times(max(self._timing.steps(ends)))
+
+    def _follow(self, starts: Tensor, wanted: Sequence[Frame]) -> Tensor:
+        """Joints (T, n, 17) of all demonstrations, by inverse kinematics."""
+        return follow_hands(
+            self.robot, starts, wanted, 1 / self.rate, self.neutral_posture()
+        )
 
     def _recorded(
         self, times: Tensor, joints: Tensor, ends: Tensor, frames: Mapping[str, Frame]
     ) -> list[Demonstration]:
-        """Demonstrations, each until its last phase ends, of frames (n,) or (n, T)."""
+        """Demonstrations, each until its last phase ends, of frames (n,) or (T, n)."""
         found = []
         for i, steps in enumerate(self._timing.steps(ends)):
             end = dict(zip(self.phases, ends[i].tolist(), strict=True))
             poses = {
-                name: pose[i, :steps] if len(pose.batch_shape) > 1 else pose[i]
+                name: pose[:steps, i] if len(pose.batch_shape) > 1 else pose[i]
                 for name, pose in frames.items()
             }
             names, events = self.robot.joint_names, self._events(end)
@@ -298,21 +300,19 @@ class BottleShaking(BottleSkill):
         state = self.robot.state(starts)
         first = {hand: state.pose(hand) for hand in HANDS}
 
-        def wanted(time: Tensor) -> list[Frame]:
-            progress = self._timing.progress(time, ends)
-            carried = between(bottles, chests, progress["bring"])
-            # from the grasp on the bottle moves, and the hand with it
-            return [
-                either(
-                    progress["bring"] > 0,
-                    attached(carried, GRASP_POINT[hand]),
-                    reached(first[hand], hand, bottles, progress),
-                )
-                for hand in HANDS
-            ]
-
-        times, joints = self._follow(starts, wanted, ends)
-        u = self._timing.progress(times[:, None], ends)["shake"]
+        times = self._times(ends)
+        progress = self._timing.progress(times[:, None], ends)
+        carried = between(bottles, chests, progress["bring"])
+        # from the grasp on the bottle moves, and the hand with it
+        wanted = [
+            either(
+                progress["bring"] > 0,
+                attached(carried, GRASP_POINT[hand]),
+                reached(first[hand], hand, bottles, progress),
+            )
+            for hand in HANDS
+        ]
+        joints, u = self._follow(starts, wanted), progress["shake"]
         ramp = minimum_jerk(8 * u) * minimum_jerk(8 * (1 - u))
         swing = amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u)
         columns = [self.robot.joint_names.index(name) for name in SHOULDERS]
@@ -342,8 +342,8 @@ def reached(start: Frame, hand: str, bottle: Frame, progress: Mapping[str, Tenso
 
 
 def either(where: Tensor, one: Frame, other: Frame) -> Frame:
-    """One pose where a condition (n,) holds, the other elsewhere."""
-    mask = where[:, None]
+    """One pose where a condition (...) holds, the other elsewhere."""
+    mask = where[..., None]
     return Frame(
         torch.where(mask, one.position, other.position),
         torch.where(mask, one.orientation, other.orientation),
@@ -381,7 +381,7 @@ def attached(frame: Frame, point: tuple[float, ...]) -> Frame:
 def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
     """The pose on a minimum-jerk way from one to another, where ``progress`` of it is done."""
     u = minimum_jerk(progress)
-    position = a.position + u[:, None] * (b.position - a.position)
+    position = a.position + u[..., None] * (b.position - a.position)
     start, end = torch.broadcast_tensors(a.orientation, b.orientation)
     return Frame(position, quaternions.slerp(start, end, u))
 
@@ -389,8 +389,8 @@ def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
 def follow_hands(
     robot: Robot,
     starts: Tensor,
-    wanted: Callable[[Tensor], list[Frame]],
-    times: Tensor,
+    wanted: Sequence[Frame],
+    dt: float,
     posture: Tensor,
 ) -> Tensor:
     """Inverse kinematics of both hands along their ways, of all demonstrations at once.
@@ -401,10 +401,10 @@ def follow_hands(
         With both hands as links; a waist that arms share shall move less than these.
     starts : Tensor of shape (n, n_joints)
         Where the joints begin [rad].
-    wanted : callable
-        Gives the poses of both hands, ``HANDS``, at times (n,).
-    times : Tensor of shape (T,)
-        At even distances [s].
+    wanted : sequence of Frame
+        Of both hands, ``HANDS``, at each of T instants, of shape (T, n).
+    dt : float
+        Between two of them [s].
     posture : Tensor of shape (n_joints,) or (n, n_joints)
         Which the null space seeks [rad].
 
@@ -415,12 +415,11 @@ def follow_hands(
     weights = torch.ones(robot.n_joints, dtype=torch.float64)
     waist = [i for i, name in enumerate(robot.joint_names) if name.startswith("waist_")]
     weights[waist] = 0.3
-    dt = float(times[1] - times[0])
     limit = robot.velocity * dt
     joints, out = starts, [starts]
-    for time in times[1:]:
+    for i in range(1, len(wanted[0].position)):
         rest = dt * (posture - joints)
-        step = _step(robot, joints, wanted(time.expand(len(starts))), weights, rest)
+        step = _step(robot, joints, [hand[i] for hand in wanted], weights, rest)
         joints = (joints + step.clamp(-limit, limit)).clamp(robot.lower, robot.upper)
         out.append(joints)
     return torch.stack(out)

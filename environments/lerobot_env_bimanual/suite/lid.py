@@ -159,10 +159,11 @@ class Lid(SuiteTask):
 
 
 def _turned(pose: Frame, angle: Tensor) -> Frame:
-    """The same place, turned about its x axis by angles (n,) [rad]."""
+    """The same place, turned about its x axis by angles (...) [rad]."""
     half, zero = angle / 2, torch.zeros_like(angle)
     turn = torch.stack((half.cos(), half.sin(), zero, zero), dim=-1)
-    return Frame(pose.position, quaternions.product(pose.orientation, turn))
+    turned = quaternions.product(pose.orientation, turn)
+    return Frame(pose.position.expand(*turned.shape[:-1], 3), turned)
 
 
 class _Judge(Judge):

@@ -169,8 +169,8 @@ class Pour(SuiteTask):
 
 
 def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:
-    """Unit quaternions (n, 4) about an axis, for angles (n,) [rad]."""
-    return quaternions.exp(angle[:, None] * angle.new_tensor(axis))
+    """Unit quaternions (..., 4) about an axis, for angles (...) [rad]."""
+    return quaternions.exp(angle[..., None] * angle.new_tensor(axis))
 
 
 def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:

@@ -106,8 +106,8 @@ class Leg:
     phase : str
         During which the hand goes there.
     target : Frame or callable
-        Poses (n,) where it arrives; or the way, a function of the share (n,) that is done of
-        the phase, which begins where the leg before it ended.
+        Poses (n,) where it arrives; or the way, a function of the share (..., n) that is done
+        of the phase, which begins where the leg before it ended.
     free : bool, default=False
         Whether it leads through free space, where ways bend aside.
     """
@@ -323,11 +323,9 @@ class SuiteTask(ABC):
         lengths = phases.steps(ends)
         times = phases.times(max(lengths))
 
-        def wanted(time: Tensor) -> list[Frame]:
-            return hands_along(hands, legs, phases.progress(time, ends), style.bow)
-
+        wanted = hands_along(hands, legs, phases.progress(times[:, None], ends), style.bow)
         posture = self.embodiment.posture + style.posture
-        joints = follow_hands(robot, starts, wanted, times, posture)
+        joints = follow_hands(robot, starts, wanted, 1 / phases.rate, posture)
         return [
             Demonstration(
                 times[:steps],
@@ -348,14 +346,14 @@ def hands_along(
     progress: Mapping[str, Tensor],
     bow: Tensor,
 ) -> list[Frame]:
-    """Where both hands should be, when a share of each phase is done.
+    """Where both hands should be, when a share of each phase is done: (..., n).
 
     Parameters
     ----------
     starts : mapping of str to Frame
         (n,)
     progress : mapping of str to Tensor
-        (n,)
+        (..., n)
     bow : Tensor of shape (n, 2, 3)
     """
     poses = []
@@ -366,7 +364,7 @@ def hands_along(
             if isinstance(leg.target, Frame):
                 pose = between(pose, leg.target, done)
             else:
-                begun, way = (done > 0)[:, None], leg.target(done)
+                begun, way = (done > 0)[..., None], leg.target(done)
                 pose = Frame(
                     torch.where(begun, way.position, pose.position),
                     torch.where(begun, way.orientation, pose.orientation),
@@ -374,7 +372,7 @@ def hands_along(
             if leg.free:
                 # nothing at both ends, without a speed there
                 bump = torch.sin(math.pi * minimum_jerk(done)).square()
-                pose = moved(pose, bump[:, None] * aside)
+                pose = moved(pose, bump[..., None] * aside)
         poses.append(pose)
     return poses
 

@@ -166,7 +166,7 @@ class Wipe(SuiteTask):
 
 
 def _zigzag(done: Tensor) -> Tensor:
-    """Places (n, 2) in the board's plane, when a share of the wiping is done [m]."""
+    """Places (..., 2) in the board's plane, when a share of the wiping is done [m]."""
     long, wide = WAY
     # at rest at the beginning and the end, and at each turn along the board
     along = done - torch.sin(2 * math.pi * STROKES * done) / (2 * math.pi * STROKES)
@@ -180,9 +180,9 @@ def _beside(board: Frame, point: tuple[float, ...]) -> Frame:
 
 
 def _on(board: Frame, place: Tensor, height: float) -> Frame:
-    """The right hand (n,) with its palm to the board, the sponge so high above it."""
-    above = torch.full_like(place[:, :1], height + 0.01 + 2 * SPONGE[1])
-    point = torch.cat((place, above), dim=1)
+    """The right hand (...) with its palm to the board, the sponge so high above it."""
+    above = torch.full_like(place[..., :1], height + 0.01 + 2 * SPONGE[1])
+    point = torch.cat((place, above), dim=-1)
     return _turned(board, point, (0.0, 0.0, TURN), (-math.pi / 2, 0.0, 0.0))
 
 
@@ -191,7 +191,8 @@ def _turned(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
     orientation = board.orientation
     for turn in turns:
         orientation = quaternions.product(orientation, quaternions.exp(vector(turn)))
-    return attached(Frame(board.transform(point), orientation), (0.0, 0.0, 0.0))
+    place = board.transform(point)
+    return attached(Frame(place, orientation.expand(*place.shape[:-1], 4)), (0.0, 0.0, 0.0))
 
 
 class _Judge(Judge):

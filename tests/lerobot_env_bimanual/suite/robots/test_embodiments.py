@@ -15,7 +15,7 @@ from lerobot_env_bimanual.suite.robots.embodiments import embodiment
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tests.support.suite_expert import TRIED, replay
 from tpgmm_datasets import load_lerobot
-from tpgmm_datasets.bottle.skill import HANDS
+from tpgmm_datasets.bottle.skill import HANDS, pose_error
 from tpgmm_evaluation.benchmarks import benchmark
 from tpgmm_torch import quaternions
 
@@ -83,25 +83,21 @@ def test_joints_do_what_experts_ask_for(name, task_name, monkeypatch):
     task, robot = suite_task(task_name, name), embodiment(name).robot
     asked = []
 
-    def spy(robot, starts, wanted, times, posture):
-        joints = follow_hands(robot, starts, wanted, times, posture)
-        asked.append((wanted, times, joints))
+    def spy(robot, starts, wanted, dt, posture):
+        joints = follow_hands(robot, starts, wanted, dt, posture)
+        asked.append((wanted, joints))
         return joints
 
     module = sys.modules[type(task).__mro__[1].__module__]
     follow_hands = module.follow_hands
     monkeypatch.setattr(module, "follow_hands", spy)
     task.demonstrations(10, seed=7, rate=FPS)
-    [(wanted, times, joints)] = asked
-    poses = [wanted(time.expand(10)) for time in times]
+    [(wanted, joints)] = asked
     state = robot.state(joints)
-    for index, hand in enumerate(HANDS):
-        places = torch.stack([both[index].position for both in poses])
-        turns = torch.stack([both[index].orientation for both in poses])
-        away = (state.position(hand) - places).norm(dim=-1)
-        turned = quaternions.product(turns, quaternions.conjugate(state.orientation(hand)))
+    for hand, target in zip(HANDS, wanted, strict=True):
+        away, turned = pose_error(state.pose(hand), target)
         assert float(away.max()) < 1e-3
-        assert float(quaternions.log(turned).norm(dim=-1).max()) < np.radians(0.5)
+        assert float(turned.max()) < np.radians(0.5)
     room = torch.minimum(joints - robot.lower, robot.upper - joints)
     assert float(room.min()) > 0.1
     assert float(joints.diff(dim=0).abs().max()) * FPS < 0.99 * float(robot.velocity.min())
