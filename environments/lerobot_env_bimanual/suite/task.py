@@ -356,9 +356,9 @@ def hands_along(
         (..., n)
     bow : Tensor of shape (n, 2, 3)
     """
-    poses = []
+    poses, batch = [], next(iter(progress.values())).shape
     for hand, aside in zip(HANDS, bow.unbind(1), strict=True):
-        pose = starts[hand]
+        pose = starts[hand].expand(batch)
         for leg in legs[hand]:
             done = progress[leg.phase]
             if isinstance(leg.target, Frame):
