@@ -73,6 +73,7 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
     assert "exists and is not a tpgmm policy" in run(*arguments, tmp_path / "policy").stderr
 
 
+@pytest.mark.slow
 def test_lerobot_eval_runs_it(directory, tmp_path):
     done = lerobot(
         "eval", f"--policy.path={directory}", "--env.type=bottle_shaking", "--env.fps=20",

@@ -155,7 +155,11 @@ def run(command: str) -> None:
 
 @pytest.mark.parametrize(
     "page",
-    [page for page in PAGES if any(language != "text" for language, _ in blocks(page))],
+    [
+        pytest.param(page, marks=[pytest.mark.slow] if page.name == "cell.md" else [])
+        for page in PAGES
+        if any(language != "text" for language, _ in blocks(page))
+    ],
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 # the demo of these tests has so few demonstrations that a fold has only two

@@ -15,6 +15,8 @@ from tests.support.lerobot_commands import lerobot
 from tpgmm_datasets.tables import demonstrations_from_frame, read_table
 from tpgmm_torch import Frame
 
+pytestmark = pytest.mark.slow
+
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorials" / "so101.md"
 #: A place of the cup that was not shown: where the tutorial puts it.
 CUP = Frame([0.23, 0.015, 0.03])

@@ -161,6 +161,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
         assert_same(load_lerobot(root)[0], old[0], 1e-6)
 
 
+@pytest.mark.slow
 def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
     environment = {
         **os.environ,

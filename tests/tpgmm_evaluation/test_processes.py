@@ -7,10 +7,13 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from tpgmm_evaluation import processes
 from tpgmm_evaluation.processes import run_jobs
 
 
+@pytest.mark.slow
 def test_jobs_that_fail_or_die_spare_the_others(tmp_path):
     texts = (
         "raise ValueError('no such luck')",

@@ -170,9 +170,7 @@ class BottleSkill:
 
     def _follow(self, starts: Tensor, wanted: Sequence[Frame]) -> Tensor:
         """Joints (T, n, 17) of all demonstrations, by inverse kinematics."""
-        return follow_hands(
-            self.robot, starts, wanted, 1 / self.rate, self.neutral_posture()
-        )
+        return follow_hands(self.robot, starts, wanted, 1 / self.rate, self.neutral_posture())
 
     def _recorded(
         self, times: Tensor, joints: Tensor, ends: Tensor, frames: Mapping[str, Frame]

@@ -17,8 +17,6 @@ import lerobot_env_bimanual  # noqa: F401  registers
 from lerobot_env_bimanual.aloha.state import AlohaStateEnv
 from tpgmm_torch.exceptions import TPGMMError
 
-pytestmark = pytest.mark.slow
-
 GYM_ID = "lerobot_env_bimanual/AlohaState-v0"
 TASKS = ("transfer_cube", "insertion")
 HOME = np.array([0, -0.96, 1.16, 0, -0.3, 0, 0.5] * 2)

@@ -15,8 +15,6 @@ from tests.support.bottle_expert import nominal, perform
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-pytestmark = pytest.mark.slow
-
 FPS = 25
 FIGURES = {"put_mm", "put_deg", "standing", "grasp_mm", "grasp_deg"}
 

@@ -17,8 +17,6 @@ from lerobot_env_bimanual.bottle.torque import CONTROLS
 from tpgmm_torch import Demonstration
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-pytestmark = pytest.mark.slow
-
 EXAMPLES = Path(__file__).parents[3] / "examples"
 N = 17
 SOFT = np.concatenate((np.full(N, 20.0), np.full(N, 2.0)))

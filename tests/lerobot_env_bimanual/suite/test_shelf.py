@@ -41,7 +41,6 @@ def done(model, seed, **options):
     return info
 
 
-@pytest.mark.slow
 def test_what_is_learned_leads_through_the_shelf_and_the_policy_around_it(model):
     blind, led = done(model, 103), done(model, 103, obstacles=f"{SHELF}:visuals")
     assert blind["inside_mm"] > 20 and not blind["is_success"]

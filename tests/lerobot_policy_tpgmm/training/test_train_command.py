@@ -15,6 +15,8 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 
+pytestmark = pytest.mark.slow
+
 RATE, BATCH, K = 10, 128, 8
 
 

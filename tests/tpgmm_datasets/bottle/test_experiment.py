@@ -7,6 +7,8 @@ import pytest
 from tpgmm_datasets.bottle.experiment import BottleExperiment
 from tpgmm_datasets.bottle.skill import BottleShaking
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory):

@@ -11,6 +11,8 @@ from tpgmm_evaluation.metaworld.__main__ import settings_of
 from tpgmm_evaluation.metaworld.learners import LEARNERS
 from tpgmm_evaluation.metaworld.networks import Perceptron, features
 
+pytestmark = pytest.mark.slow
+
 
 def test_networks_are_told_where_the_hand_is_as_seen_from_objects():
     [seen] = features(reaching(1).observed[:1], relative=True)

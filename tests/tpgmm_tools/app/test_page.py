@@ -25,6 +25,8 @@ from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.persistence import load_model
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def bottles():

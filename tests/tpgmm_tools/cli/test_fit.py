@@ -146,6 +146,7 @@ def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
     assert "(way 0: p = " in output("reproduce", tmp_path / "model", *new)
 
 
+@pytest.mark.slow
 def test_batches_and_processes_learn_the_same(tmp_path):
     shown = [
         Demonstration(np.arange(40 - i) / 20, d.joints[: 40 - i], joint_names=("a", "b", "c"))

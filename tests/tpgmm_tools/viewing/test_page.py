@@ -18,6 +18,8 @@ from tpgmm_torch import Frame, Situation
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DependencyError
 
+pytestmark = pytest.mark.slow
+
 
 def reproduced(model, situation):
     """Within the robot's bounds, led in from the start posture."""

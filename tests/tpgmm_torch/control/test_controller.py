@@ -303,7 +303,7 @@ def test_a_robot_in_a_batch_is_what_it_is_alone(clock, jitter):
     """With faults in some of them, at different times, and ticks of their own."""
     problem = Problem.of(CASES["the paper's"], 3, 8)
     batch = watched(problem, clock=clock)
-    alone = [watched(problem, robot, clock=clock) for robot in range(8)]
+    alone = {robot: watched(problem, robot, clock=clock) for robot in (0, 2, 3, 5)}
     rng = np.random.default_rng(0)
     for k in range(130):
         joints = batch.reference + torch.from_numpy(1e-3 * rng.standard_normal((8, 17)))
@@ -320,7 +320,7 @@ def test_a_robot_in_a_batch_is_what_it_is_alone(clock, jitter):
             poses[3] = torch.nan
         steps = 0.01 * (1 + jitter * torch.from_numpy(rng.uniform(-1, 3, 8)))
         command = batch.step(steps, joints, {OBJECT: poses})
-        for robot, one in enumerate(alone):
+        for robot, one in alone.items():
             single = one.step(float(steps[robot]), joints[robot], {OBJECT: poses[robot]})
             assert_close(command.reference[robot], single.reference, 1e-9)
             assert command.status[robot] == single.status

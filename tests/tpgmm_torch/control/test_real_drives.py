@@ -7,6 +7,8 @@ from tests.support.skills import bottle_demonstrations, small_bottle
 from tpgmm_evaluation.faults.servos import Servo, Servos
 from tpgmm_torch import Controller
 
+pytestmark = pytest.mark.slow
+
 PERIOD = 0.02
 STEPS = np.arange(1, 21)[:, None] / 20  # 1 kHz
 SHOWN = bottle_demonstrations()[5]
@@ -24,13 +26,10 @@ def test_between_ticks_the_cubic_is_smooth_and_late_and_others_step():
     s, q, v = STEPS, *(np.array(part)[:, None] for part in zip(*commands, strict=True))
     cubic = (2 * s**3 - 3 * s**2 + 1) * q[:-1] + (s**3 - 2 * s**2 + s) * v[:-1]
     cubic = cubic + (3 * s**2 - 2 * s**3) * q[1:] + (s**3 - s**2) * v[1:]
-    line = q[:-1] + s * (q[1:] - q[:-1])
-    ways = cubic, line, (q + s * v)[:-1], (q + 0 * s)[:-1]
-    steps, jerks = np.transpose(
-        [
-            [np.abs(np.diff(way.reshape(-1, 17), n, axis=0)).max() for n in (1, 2)]
-            for way in ways
-        ]
+    ways = cubic, q[:-1] + s * (q[1:] - q[:-1]), (q + s * v)[:-1], (q + 0 * s)[:-1]
+    steps, jerks = (
+        np.array([np.abs(np.diff(way.reshape(-1, 17), n, axis=0)).max() for way in ways])
+        for n in (1, 2)
     )
     # of a line, of extrapolated references and of those that are held, in units of the cubic's
     assert steps[0] == pytest.approx(0.7e-3, rel=0.1)

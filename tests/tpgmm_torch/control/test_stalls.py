@@ -8,25 +8,22 @@ from tpgmm_evaluation.faults.drawing import Fault
 from tpgmm_evaluation.faults.servos import Servo
 from tpgmm_evaluation.faults.skills import situations
 
+pytestmark = pytest.mark.slow
+
 LAGS = (0.02, 0.14, 0.4)
 
 
-def touched(size, begin=1.5, end=3.0, joint=1):
+def touched(size):
     """Something stands in the way of a joint of the arm with a gripper, when it arrives."""
-    path = situations("gripper")[0].path[:, joint]
-    way = np.sign(path[100] - path[50]) * np.eye(3)[joint]
-    return Fault("contact", begin, end, way, size)
-
-
-def grasped(size):
-    """The gripper closes on something, and does not open again."""
-    return Fault("grasp", 2.1, 100.0, np.eye(3)[2], size)
+    way = np.sign(np.diff(situations("gripper")[0].path[[50, 100], 1])) * np.eye(3)[1]
+    return Fault("contact", 1.5, 3.0, way, size)
 
 
 @pytest.mark.parametrize("lag", LAGS)
 @pytest.mark.parametrize("size", [0.02, 0.045, 0.1])
 def test_contact_while_a_gripper_closes_on_something(size, lag):
-    found = measures(20, Servo(lag=lag), [touched(size), grasped(0.8)], "gripper")
+    grasped = Fault("grasp", 2.1, 100.0, np.eye(3)[2], 0.8)  # and does not open again
+    found = measures(20, Servo(lag=lag), [touched(size), grasped], "gripper")
     assert {name: found[name] for name in BOUNDS} == dict.fromkeys(BOUNDS, 0)
     assert not found["open"]
 

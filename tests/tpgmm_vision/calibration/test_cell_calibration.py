@@ -20,6 +20,8 @@ from tpgmm_vision.detection.tags import Detections
 from tpgmm_vision.poses import inverse, rigid
 from tpgmm_vision.targets import Target, cube
 
+pytestmark = pytest.mark.slow
+
 N = 30
 
 

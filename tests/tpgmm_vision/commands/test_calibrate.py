@@ -15,6 +15,8 @@ from tpgmm_vision.commands.calibrate import app
 from tpgmm_vision.poses import angle_between
 from tpgmm_vision.targets import Board
 
+pytestmark = pytest.mark.slow
+
 KEY = "observation.images.front"
 CUBE = "cube:10,11,12,13,14:0.03"
 

@@ -19,6 +19,8 @@ from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_vision.episodes.tracking import track_lerobot
 from tpgmm_vision.poses import pose_vector, rigid
 
+pytestmark = pytest.mark.slow
+
 ROBOT = Poses(["hand"])
 #: Rows of the episodes, in which of them the tag is covered, and how far all is moved.
 EPISODES = ((60, (), 0.0), (65, ((30, 36),), 0.02), (60, ((15, 47),), -0.02))

@@ -15,6 +15,8 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.layout import open_layout
 from tpgmm_vision.episodes.video import EpisodePictures
 
+pytestmark = pytest.mark.slow
+
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 VIDEO = f"videos/{KEY}/chunk-000/file-000.mp4"
 LENGTHS = (30, 24, 27)
