@@ -18,7 +18,7 @@ from lerobot_env_bimanual.control_rate import rate_processors
 from lerobot_env_bimanual.disturbances import NOMINAL
 from lerobot_env_bimanual.metaworld.tasks import check_task
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
-from lerobot_env_bimanual.suite.names import MORE, OBSTRUCTED, ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.names import ROBOTS, UPPER_BODY, tasks_of
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
@@ -214,8 +214,8 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
     Parameters
     ----------
     task : str, default="handover"
-        One of :data:`~lerobot_env_bimanual.suite.names.SUITE`, ``pick_place`` or
-        ``shelf``.
+        One of :data:`~lerobot_env_bimanual.suite.names.SUITE`, ``pick_place`` or, by the
+        upper body, ``shelf``.
     robot : str, default="upper_body"
         One of :data:`~lerobot_env_bimanual.suite.names.ROBOTS`.
     force : bool, default=False
@@ -240,7 +240,7 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
     def __post_init__(self) -> None:
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
-        self._observe({**SUITE, **MORE, **OBSTRUCTED}, ROBOTS[self.robot])
+        self._observe(tasks_of(self.robot), ROBOTS[self.robot])
         super().__post_init__()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["MORE", "OBSTRUCTED", "ROBOTS", "SUITE", "UPPER_BODY"]
+__all__ = ["MORE", "OBSTRUCTED", "ROBOTS", "SUITE", "UPPER_BODY", "tasks_of"]
 
 #: Who does the tasks unless another is named.
 UPPER_BODY = "upper_body"
@@ -24,5 +24,10 @@ SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
 )
 #: The same of tasks that are in no comparison.
 MORE: Mapping[str, tuple[str, ...]] = MappingProxyType({"pick_place": ("baton", "stand")})
-#: The same of tasks with an obstacle that experts know nothing of.
+#: The same of tasks with an obstacle that experts know nothing of, placed for the upper body.
 OBSTRUCTED: Mapping[str, tuple[str, ...]] = MappingProxyType({"shelf": ("baton", "stand")})
+
+
+def tasks_of(robot: str) -> Mapping[str, tuple[str, ...]]:
+    """What is observed in each task that a robot does."""
+    return {**SUITE, **MORE, **(OBSTRUCTED if robot == UPPER_BODY else {})}

@@ -6,7 +6,7 @@ import functools
 
 from lerobot_env_bimanual.suite.handover import Handover
 from lerobot_env_bimanual.suite.lid import Lid
-from lerobot_env_bimanual.suite.names import UPPER_BODY
+from lerobot_env_bimanual.suite.names import UPPER_BODY, tasks_of
 from lerobot_env_bimanual.suite.peg_in_hole import PegInHole
 from lerobot_env_bimanual.suite.pick_place import PickPlace, Shelf
 from lerobot_env_bimanual.suite.pour import Pour
@@ -29,10 +29,11 @@ def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
     Raises
     ------
     UnknownNameError
-        If it does not exist.
+        If it does not exist, or the robot does not do it.
     DependencyError
         If the robot's description is in a package that is not installed.
     """
-    if name not in TASKS:
-        raise UnknownNameError("task", name, "the suite", TASKS)
-    return TASKS[name](embodiment(robot))
+    done_by = embodiment(robot)
+    if name not in tasks_of(robot):
+        raise UnknownNameError("task", name, f"the suite of {robot!r}", tasks_of(robot))
+    return TASKS[name](done_by)

@@ -90,6 +90,15 @@ def test_tasks_that_do_not_exist_are_refused():
             make("juggle")
 
 
+def test_the_shelf_is_placed_for_the_upper_body_alone():
+    for make in (
+        SuiteEnv,
+        lambda task, robot: make_env_config("bimanual", task=task, robot=robot),
+    ):
+        with pytest.raises(UnknownNameError, match=r"shelf.*pick_place"):
+            make("shelf", "viperx")
+
+
 def test_robots_that_do_not_exist_are_refused():
     for make in (
         SuiteEnv,
