@@ -68,7 +68,7 @@ test: $(VENV)/.installed-test ## Run the tests but slow ones; all, as CI: PYTEST
 oldest: ## Run the tests of the core with the oldest versions promised, in .venv-oldest
 	$(firstword $(wildcard $(BIN)/python) python3) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install --disable-pip-version-check \
-	    --constraint constraints-oldest.txt '.[cli,hub,simulation]' \
+	    --constraint constraints-oldest.txt '.[cli,collada,hub,simulation]' \
 	    'pytest>=8.2' 'pytest-timeout>=2.3' 'hypothesis>=6.100' 'gmr>=2.0' 'packaging>=24.2' 'pytorch-kinematics>=0.10' \
 	    'example-robot-data>=4.1' pin==2.7.0
 	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_datasets tests/tpgmm_tools \

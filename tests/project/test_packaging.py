@@ -218,7 +218,7 @@ def test_the_build_back_end_and_its_tools_are_among_the_test_requirements():
 def test_the_oldest_versions_are_those_that_are_promised():
     """Extras that need newer ones of what others need too are not among them."""
     promised = {}
-    for requirement in requirements("cli", "hub", "simulation"):
+    for requirement in requirements("cli", "collada", "hub", "simulation"):
         for bound in requirement.specifier:
             if bound.operator == ">=":
                 promised[canonicalize_name(requirement.name)] = Version(bound.version)
