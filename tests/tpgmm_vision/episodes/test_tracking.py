@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.support.command_line import run
 from tests.support.lerobot_sets import change_info
 from tests.support.recorded_tags import KEY, NUMBER, carried, cell_content, record
 from tpgmm_datasets import describe_lerobot, load_lerobot
@@ -146,10 +147,16 @@ def test_events_and_holds_are_found_in_tracks(tracked):
     assert 1.6 < hold.end < 2.1
 
 
+@pytest.mark.filterwarnings("always::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_without_a_robot_what_is_covered_on_the_way_stays_unknown(original, cell, tmp_path):
     reports = track_lerobot(original, tmp_path / "out", cell)
     known = [one.tracks["cup"].known.all() for one in reports]
     assert known == [True, False, False]
+    done = run("dataset", "track", original, tmp_path / "again", "--cell", cell)
+    assert done.exit_code == 0
+    assert "in episodes 1,2, and their last poses are repeated. With --robot" in " ".join(
+        done.stderr.split()
+    )
 
 
 def test_episodes_that_cannot_be_tracked_are_named_and_nothing_is_written(cell, tmp_path):

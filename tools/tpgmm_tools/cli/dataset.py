@@ -300,6 +300,7 @@ def track(
     from rich.progress import Progress
 
     from tpgmm_torch.checks.report import in_columns
+    from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_vision.episodes.report import table
     from tpgmm_vision.episodes.tracking import track_lerobot
 
@@ -316,6 +317,14 @@ def track(
 
         reports = track_lerobot(path, out, cell, robot, **reading, progress=advance)
     typer.echo(in_columns(table(reports)))
+    known = {str(one.index): [t.known.mean() for t in one.tracks.values()] for one in reports}
+    if unknown := [index for index, shares in known.items() if min(shares) < 0.95]:
+        carried = "" if robot else "With --robot, what hands carry is known. "
+        text = (
+            f"objects are unknown for a while in episodes {','.join(unknown)}, and their last "
+            f"poses are repeated. {carried}Leave such episodes out of 'tpgmm fit' (--episodes)"
+        )
+        warnings.warn(text, PlausibilityWarning, stacklevel=1)
     typer.echo(f"{len(reports)} episodes tracked in the copy {out}; look at {out}/report.html")
 
 
