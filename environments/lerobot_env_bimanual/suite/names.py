@@ -29,5 +29,5 @@ OBSTRUCTED: Mapping[str, tuple[str, ...]] = MappingProxyType({"shelf": ("baton",
 
 
 def tasks_of(robot: str) -> Mapping[str, tuple[str, ...]]:
-    """What is observed in each task that a robot does."""
+    """Observed objects of each task that a robot does, by the names of the tasks."""
     return {**SUITE, **MORE, **(OBSTRUCTED if robot == UPPER_BODY else {})}

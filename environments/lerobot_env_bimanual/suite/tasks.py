@@ -33,7 +33,7 @@ def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
     DependencyError
         If the robot's description is in a package that is not installed.
     """
-    done_by = embodiment(robot)
-    if name not in tasks_of(robot):
-        raise UnknownNameError("task", name, f"the suite of {robot!r}", tasks_of(robot))
-    return TASKS[name](done_by)
+    body, known = embodiment(robot), tasks_of(robot)
+    if name not in known:
+        raise UnknownNameError("task", name, f"the suite of {robot!r}", known)
+    return TASKS[name](body)

@@ -1,6 +1,7 @@
 """The suite as gymnasium, Stable-Baselines3 and LeRobot see it; hands, disturbances, noise."""
 
 import warnings
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -84,28 +85,19 @@ def test_every_option_of_the_environment_is_one_of_the_configuration():
     assert SuiteEnv(**config.gym_kwargs).episode_length == 9
 
 
-def test_tasks_that_do_not_exist_are_refused():
-    for make in (SuiteEnv, lambda task: make_env_config("bimanual", task=task)):
-        with pytest.raises(UnknownNameError, match=r"juggle.*handover"):
-            make("juggle")
-
-
-def test_the_shelf_is_placed_for_the_upper_body_alone():
-    for make in (
-        SuiteEnv,
-        lambda task, robot: make_env_config("bimanual", task=task, robot=robot),
-    ):
-        with pytest.raises(UnknownNameError, match=r"shelf.*pick_place"):
-            make("shelf", "viperx")
-
-
-def test_robots_that_do_not_exist_are_refused():
-    for make in (
-        SuiteEnv,
-        lambda task, robot: make_env_config("bimanual", task=task, robot=robot),
-    ):
-        with pytest.raises(UnknownNameError, match=r"octopus.*upper_body.*viperx"):
-            make("lid", "octopus")
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": "juggle"}, r"juggle.*handover"),
+        ({"task": "shelf", "robot": "viperx"}, r"shelf.*pick_place"),
+        ({"task": "lid", "robot": "octopus"}, r"octopus.*upper_body.*viperx"),
+    ],
+    ids=["no such task", "placed for the upper body", "no such robot"],
+)
+@pytest.mark.parametrize("make", [SuiteEnv, partial(make_env_config, "bimanual")])
+def test_tasks_and_robots_that_do_not_exist_are_refused(make, options, message):
+    with pytest.raises(UnknownNameError, match=message):
+        make(**options)
 
 
 def test_every_robot_has_as_many_joints_as_is_known_without_mujoco():
