@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import LEVER
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
+from tpgmm_torch.skills.reproduction import reproduce
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["in_skill_time"]
@@ -88,7 +88,7 @@ def _placed(
     situation = Situation(shown.joints[0], Situation.of(shown).frames, time)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)  # a correction begins anywhere
-        [reproduced] = rollout(skill, [situation])
+        [reproduced] = reproduce(skill, [situation])
     path, ends = (
         _features(skill, joints) for joints in (reproduced.joints, shown.joints[[0, -1]])
     )

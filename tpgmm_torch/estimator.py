@@ -13,7 +13,6 @@ from torch import Tensor
 
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
-from tpgmm_torch.control.rollout import rollout, sample
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
@@ -23,6 +22,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.reproduction import reproduce, sample
 from tpgmm_torch.skills.situations import report_start, tick_inputs
 from tpgmm_torch.training.learning import Learned, known, learn
 from tpgmm_torch.training.local_data import local_data
@@ -253,7 +253,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
             If a situation does not fit the model, or cannot be what it is taken for.
         """
         skill: Any = self.skill
-        return rollout(skill, X, candidates=candidates)
+        return reproduce(skill, X, candidates=candidates)
 
     def step(
         self,

@@ -60,7 +60,7 @@ from tpgmm_torch.control.command import Command
 from tpgmm_torch.control.estimate import choose, estimate
 from tpgmm_torch.control.gates import Gates, Moment
 from tpgmm_torch.control.hold import Holds
-from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.control.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest

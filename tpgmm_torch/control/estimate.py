@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.exceptions import TPGMMError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.control.hold import LOST, LOST_TIME, LOST_TURN
-from tpgmm_torch.control.holding import MOVED, Holding, choose
+from tpgmm_torch.skills.holding import MOVED, Holding, choose
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.holding import (
+from tpgmm_torch.skills.holding import (
     MOVED,
     NO,
     PERHAPS,

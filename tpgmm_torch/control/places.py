@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.control.locate import NEARBY
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame

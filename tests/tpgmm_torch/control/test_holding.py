@@ -27,7 +27,7 @@ from tpgmm_torch import (
     RelativePosition,
     quaternions,
 )
-from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.base import carried_objects
 from tpgmm_torch.sensing.inputs import Inputs

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tests.support.motions import ease
 from tpgmm_torch import Clock, Controller, Demonstration, TaskParameterizedGMM
-from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
