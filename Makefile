@@ -89,7 +89,7 @@ newest: ## Run the tests with the newest versions that are allowed, in .venv-new
 fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
 	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest --timeout 0 \
 	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py \
-	    tests/tpgmm_torch/control/test_controller.py $(PYTEST_ARGS)
+	    tests/tpgmm_control/loop/test_controller.py $(PYTEST_ARGS)
 
 mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)

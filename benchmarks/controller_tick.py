@@ -19,7 +19,8 @@ from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
 from benchmarks.skill import learned, skill
 from benchmarks.timing import in_turns, medians, seconds
-from tpgmm_torch import Controller, Situation
+from tpgmm_control import Controller
+from tpgmm_torch import Situation
 from tpgmm_torch.skills.compiled import export_estimate
 
 __all__ = ["measure"]

@@ -28,19 +28,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tpgmm_control import Controller
+from tpgmm_control.obstacles import Scene, Shape
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
 from tpgmm_evaluation.report.tables import wilson
-from tpgmm_torch import (
-    Controller,
-    Demonstration,
-    Frame,
-    Hold,
-    TaskParameterizedGMM,
-    ViaPoints,
-)
+from tpgmm_torch import Demonstration, Frame, Hold, TaskParameterizedGMM, ViaPoints
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.obstacles import Scene, Shape
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.skills.via_points import ViaPoint
 

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 import torch
 
+from tpgmm_evaluation.policies.inverse_kinematics import follow_poses
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -34,7 +35,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.motion.inverse_kinematics import follow_poses
 
 HANDS = ("left_rubber_hand", "right_rubber_hand")
 JOINTS = ["waist_*", *(f"{side}_{part}*" for side in ("left", "right") for part in

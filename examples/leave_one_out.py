@@ -53,6 +53,7 @@ import torch
 from scipy.stats import quantile_test
 from torch import Tensor
 
+from tpgmm_control import rollout
 from tpgmm_datasets import LinkPose, load_lerobot
 from tpgmm_torch import (
     AbsoluteOrientation,
@@ -67,7 +68,6 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
     quaternions,
-    rollout,
 )
 from tpgmm_torch.alignment import (
     DynamicTimeWarping,

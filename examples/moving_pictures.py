@@ -27,12 +27,13 @@ from PIL import Image, ImageDraw
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
+from tpgmm_control import Controller
+from tpgmm_control.impedance.stiffness import Impedance
+from tpgmm_control.loop.command import Command, Status
 from tpgmm_evaluation.benchmarks import BottleBenchmark, CarryBenchmark
 from tpgmm_tools.plotting import BLUE, VERMILION
-from tpgmm_torch import Controller, Frame, TaskParameterizedGMM
+from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.control.command import Command, Status
-from tpgmm_torch.impedance.stiffness import Impedance
 
 #: File, task, condition of the environment, what happens.
 EPISODES = {

@@ -12,15 +12,9 @@ next begins, and every demonstration takes its own time.
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_control import rollout
 from tpgmm_tools.plotting import STYLE, plot_parts
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    SelectOperators,
-    Situation,
-    TaskParameterizedGMM,
-    rollout,
-)
+from tpgmm_torch import Demonstration, Frame, SelectOperators, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses

@@ -12,6 +12,7 @@ model of each, and goes the way that suits the situation.
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_control import rollout
 from tpgmm_tools.plotting import BLUE, ORANGE, SKY, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
@@ -20,7 +21,6 @@ from tpgmm_torch import (
     RelativePosition,
     Situation,
     TaskParameterizedGMM,
-    rollout,
 )
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.structure.select_ways import SelectWays

@@ -14,8 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.base import clone
 
+from tpgmm_control import rollout
 from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
-from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoints, rollout
+from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoints
 from tpgmm_torch.corrections import in_skill_time
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.skills.via_point import ViaPoint

@@ -14,9 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_control import Controller
 from tpgmm_tools.plotting import BLUE, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
-    Controller,
     Demonstration,
     Frame,
     RelativePosition,

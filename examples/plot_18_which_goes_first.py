@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_control import rollout
 from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
@@ -24,7 +25,6 @@ from tpgmm_torch import (
     Robot,
     Situation,
     TaskParameterizedGMM,
-    rollout,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.regression.fusion_forms import InformationFusion

@@ -5,22 +5,16 @@ Pressing on a board that is not where it is thought
 Wiping is a motion along a board and a force into it. Positions alone press too hard on a board
 that is 5 mm too high, and wipe the air above one that is too low. Demonstrations with wrenches,
 and :class:`~tpgmm_torch.operators.Wrench`, tell a model which force belongs to which instant;
-the controller's :class:`~tpgmm_torch.contact.Admittance` moves references until it is felt.
+the controller's :class:`~tpgmm_control.contact.Admittance` moves references until it is felt.
 """
 
 # sphinx_gallery_thumbnail_number = 1
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_control import Controller
 from tpgmm_tools.plotting import BLUE, ORANGE, STYLE, VERMILION
-from tpgmm_torch import (
-    Canonical,
-    Controller,
-    Demonstration,
-    Frame,
-    RelativePosition,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, TaskParameterizedGMM
 from tpgmm_torch.operators import Wrench
 from tpgmm_torch.robots import Poses
 

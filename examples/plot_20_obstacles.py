@@ -13,11 +13,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_control import Controller
+from tpgmm_control.obstacles import Scene, Shape, find_contacts
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
-from tpgmm_torch import Controller, TaskParameterizedGMM
-from tpgmm_torch.obstacles import Scene, Shape, find_contacts
+from tpgmm_torch import TaskParameterizedGMM
 
 warnings.simplefilter("ignore")
 torch.set_num_threads(1)

@@ -14,10 +14,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_control import Controller
 from tpgmm_tools.plotting import STYLE
 from tpgmm_torch import (
     Canonical,
-    Controller,
     Demonstration,
     Frame,
     Hold,

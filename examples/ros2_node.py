@@ -32,7 +32,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from tpgmm_torch import Controller, Frame
+from tpgmm_control import Controller
+from tpgmm_torch import Frame
 from tpgmm_torch.persistence import load_model
 
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.torque import BottleTorqueEnv
+from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, Trajectory
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.impedance.stiffness import Impedance
 
 FPS = 50
 #: Gains of position control [N m/rad, N m s/rad].

@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.control.clock import Clock
-    from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -38,8 +35,6 @@ __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
     "Canonical",
-    "Clock",
-    "Controller",
     "Demonstration",
     "Frame",
     "Hold",
@@ -58,13 +53,10 @@ __all__ = [
     "attach_holds",
     "find_holds",
     "load",
-    "rollout",
     "save",
 ]
 
 _HOMES = {
-    "control.clock": ("Clock",),
-    "control.controller": ("Controller",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
@@ -78,7 +70,6 @@ _HOMES = {
         "Stack",
     ),
     "persistence": ("load", "save"),
-    "control.rollout": ("rollout",),
     "robots.robot": ("Robot",),
     "skills.sequence": ("Sequence",),
     "skills.via_points": ("ViaPoints",),

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from tpgmm_control import rollout
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_tools.plotting import ORANGE
-from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, rollout
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import largest_acceleration
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion

@@ -33,13 +33,14 @@ from lerobot_policy_tpgmm.policy_files import PATTERNS, read_model, write_files
 from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
+from tpgmm_control.loop.command import Command, Status
+from tpgmm_control.loop.controller import Controller
+from tpgmm_control.obstacles import Scene
 from tpgmm_datasets.lerobot.columns import WRENCH
 from tpgmm_tools.arguments.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import consistent, read_whole, recover
-from tpgmm_torch.control.command import Command, Status
-from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
     ModelFileError,
@@ -48,7 +49,6 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     TPGMMError,
 )
-from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator

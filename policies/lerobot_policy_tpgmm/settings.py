@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from tpgmm_control.loop.clock import Clock
+from tpgmm_control.sensing.pose_filter import OneEuro
+from tpgmm_control.sensing.trust import Trust
 from tpgmm_torch.alignment.text import METHODS
-from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
-from tpgmm_torch.sensing.pose_filter import OneEuro
-from tpgmm_torch.sensing.trust import Trust
 
 __all__ = ["ControlConfig", "EMConfig", "FusionConfig", "TrainingConfig"]
 
@@ -107,7 +107,7 @@ class ControlConfig:
     Parameters
     ----------
     clock : str, default="localizing:initial=anywhere"
-        How time goes on, as :meth:`tpgmm_torch.Clock.parse` takes it:
+        How time goes on, as :meth:`tpgmm_control.Clock.parse` takes it:
         ``"even"``, ``"waiting"`` or ``"localizing"``, with options. By default an episode may
         begin in the middle of the skill.
     smoothing : float or None, default=0.5
@@ -147,7 +147,7 @@ class ControlConfig:
     closed_loop: bool = True
 
     def options(self) -> dict[str, Any]:
-        """Options of :class:`tpgmm_torch.Controller`.
+        """Options of :class:`tpgmm_control.Controller`.
 
         Raises
         ------

@@ -13,7 +13,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.locate import LONGEST_TICK
+from tpgmm_control.loop.locate import LONGEST_TICK
 
 __all__ = ["TickDurations"]
 

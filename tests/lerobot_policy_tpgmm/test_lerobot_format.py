@@ -14,9 +14,9 @@ from tests.support.command_line import output, run
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tpgmm_control import rollout as reproduced
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration
-from tpgmm_torch import rollout as reproduced
 
 NAMES = fitted().kinematics.joint_names
 PARTS = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]

@@ -28,8 +28,9 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
-from tpgmm_torch import Canonical, Controller, Frame, Situation, TaskParameterizedGMM
-from tpgmm_torch.control.rollout import rollout
+from tpgmm_control import Controller
+from tpgmm_control.loop.rollout import rollout
+from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.

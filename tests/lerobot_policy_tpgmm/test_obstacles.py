@@ -4,8 +4,8 @@ import pytest
 
 from tests.support.policies import act, batch, changed, played
 from tests.support.skills import bottle_demonstrations
+from tpgmm_control.obstacles import Scene
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.obstacles import Scene
 
 STEPS = 100
 WORLD = "<mujoco><worldbody><geom name='ball' size='0.03' pos='{}'/></worldbody></mujoco>"

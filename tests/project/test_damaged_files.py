@@ -23,6 +23,8 @@ from tests.support.damage import (
 )
 from tests.support.policies import ENVIRONMENT, STATE, act, batch, fitted
 from tests.support.skills import hands
+from tpgmm_control.loop.controller import Controller
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_datasets.situation_files import read_situations
@@ -33,8 +35,6 @@ from tpgmm_datasets.tables import (
     write_table,
 )
 from tpgmm_torch import Demonstration, Robot, Situation, load, save
-from tpgmm_torch.control.controller import Controller
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import TPGMMError
 from tpgmm_torch.skills.via_points import ViaPoints

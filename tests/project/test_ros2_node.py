@@ -9,7 +9,8 @@ import pytest
 
 from tests.support import ros_stub, skills
 from tests.support.skills import small_bottle
-from tpgmm_torch import Controller, save
+from tpgmm_control import Controller
+from tpgmm_torch import save
 
 FILE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
 

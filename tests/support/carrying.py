@@ -10,17 +10,10 @@ import torch
 from torch import Tensor
 
 from tests.support.worlds import upper_body
+from tpgmm_control import Controller
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import (
-    Controller,
-    Demonstration,
-    Frame,
-    Hold,
-    Situation,
-    TaskParameterizedGMM,
-    quaternions,
-)
+from tpgmm_torch import Demonstration, Frame, Hold, Situation, TaskParameterizedGMM, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator

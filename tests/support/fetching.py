@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from tpgmm_control import Controller
 from tpgmm_torch import (
     Canonical,
-    Controller,
     Demonstration,
     Frame,
     Hold,

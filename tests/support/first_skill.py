@@ -9,8 +9,8 @@ import torch
 from tests.support.lerobot_sets import DATA, change_info, change_table
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.robots import so101_urdf
+from tpgmm_evaluation.policies.inverse_kinematics import reach
 from tpgmm_torch import Demonstration, Frame, Robot, quaternions
-from tpgmm_torch.motion.inverse_kinematics import reach
 
 __all__ = ["FPS", "GRASP", "bimanual", "record"]
 

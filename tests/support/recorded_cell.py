@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.robots import so101_urdf
+from tpgmm_evaluation.policies.inverse_kinematics import reach
 from tpgmm_torch import Frame, Robot
-from tpgmm_torch.motion.inverse_kinematics import reach
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import camera_content, pose_content
 from tpgmm_vision.poses import Array, inverse, pose_matrix, rigid, transformed

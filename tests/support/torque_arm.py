@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import torch
 
+from tpgmm_control.torque import MujocoDynamics
 from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Robot, Stack
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.wrench import Wrench
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.torque import MujocoDynamics
 
 POSTURE = np.array([0.2, 0.5, -0.1, 1.5, 0.3, 0.9, -0.4])
 LIMITS = np.array([80.0, 80.0, 80.0, 80.0, 12.0, 12.0, 12.0])

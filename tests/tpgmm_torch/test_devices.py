@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from tests.support.skills import bottle_model, few_bottles, handlings, hands_model
-from tpgmm_torch import Controller, Situation, TaskParameterizedGMM, load, save
-from tpgmm_torch.control.rollout import rollout
+from tpgmm_control import Controller
+from tpgmm_control.loop.rollout import rollout
+from tpgmm_torch import Situation, TaskParameterizedGMM, load, save
 
 DEVICES = [
     "cpu",

@@ -48,9 +48,10 @@ from tests.support.skills import (
     waves,
 )
 from tests.support.worlds import MOVED, OBJECT, OnPoses, OnRobot, moved, upper_body
+from tpgmm_control import Controller
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_torch import (
     Canonical,
-    Controller,
     Demonstration,
     Frame,
     Hold,
@@ -59,7 +60,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     save,
 )
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import (
     DataError,
     InvalidParameterError,

@@ -17,6 +17,7 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
+from tpgmm_control import rollout
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -27,7 +28,6 @@ from tpgmm_torch import (
     ViaPoints,
     Ways,
     load,
-    rollout,
     save,
 )
 from tpgmm_torch.exceptions import ModelFileError, NotFittedError

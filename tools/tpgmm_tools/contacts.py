@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from tpgmm_control.obstacles import Contact, Scene, find_contacts
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
-from tpgmm_torch.obstacles import Contact, Scene, find_contacts
 
 __all__ = ["contacts"]
 

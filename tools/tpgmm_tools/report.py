@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from sklearn.base import clone
 
+from tpgmm_control.loop.rollout import rollout
+from tpgmm_control.obstacles import Scene
 from tpgmm_tools.contacts import contacts
 from tpgmm_tools.hub.model_card import sections
 from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
@@ -23,14 +25,12 @@ from tpgmm_tools.viewing import write_motion
 from tpgmm_tools.viewing.curves import motion_marks, turning_joints
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.checks.summary import UNLIKELY
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
-from tpgmm_torch.obstacles import Scene
 from tpgmm_torch.operators.base import of_joints
 
 __all__ = ["LeftOut", "leave_one_out", "write_report"]

@@ -30,7 +30,7 @@ class Wrench(Operator):
     Local coordinates are the components of the force along the axes [N], and 1 in contact, 0
     without, so that their mean over time is the share of contact. It stands behind all other
     operators, has no rows in joint space, and changes no estimate of the joints: what uses it
-    are :class:`~tpgmm_torch.contact.Admittance` and controllers of torque.
+    are :class:`~tpgmm_control.contact.Admittance` and controllers of torque.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ CONDITIONS = ("arrived", "held", "free")
 CONTACT = "contact:"
 #: Share of a fade in which a separate skill takes over: none while the gate is closed.
 SWITCH = 0.01
-#: The name of one, or a function of a :class:`~tpgmm_torch.control.gates.Moment`.
+#: The name of one, or a function of a :class:`~tpgmm_control.loop.gates.Moment`.
 Condition = str | Callable[[Any], Any]
 
 

@@ -52,7 +52,7 @@ class Sequence(CompositeSkill):
         ``"arrived"``: the joints are where the reference is, at rest; ``"held"``: each object
         that the skill ends holding has moved along with its hand; ``"free"``: each object that
         it let go has not; ``"contact:LINK"``; or a function of a
-        :class:`~tpgmm_torch.control.gates.Moment` that gives a bool, or one of each robot.
+        :class:`~tpgmm_control.loop.gates.Moment` that gives a bool, or one of each robot.
     retry : int or sequence, default=0
         How often it is tried again if that is not the case in time, one number for all skills,
         or one of each; a pair ``(number, skill)`` says from the beginning of which skill, by

@@ -121,7 +121,8 @@ class SelectWays(DemonstrationEstimator):
 
     Examples
     --------
-    >>> from tpgmm_torch import Demonstration, Situation, rollout
+    >>> from tpgmm_control import rollout
+    >>> from tpgmm_torch import Demonstration, Situation
     >>> from tpgmm_torch.structure.select_ways import SelectWays
     >>> rng, time = np.random.default_rng(0), np.linspace(0, 1, 50)
     >>> shown = [

@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_control import rollout
 from tpgmm_datasets.bottle.figures import draw_figures
 from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, TASK, BottleShaking
@@ -39,7 +40,6 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
     Trajectory,
-    rollout,
     save,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_control.loop.controller import Controller
 from tpgmm_evaluation.faults.drawing import POSES, READINGS, Fault, Run
 from tpgmm_evaluation.faults.servos import Servos
 from tpgmm_evaluation.faults.skills import PATH_RATE
-from tpgmm_torch.control.controller import Controller
 
 __all__ = ["Log", "Tick", "simulate"]
 

@@ -14,11 +14,11 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from tpgmm_evaluation.policies.aligned import Aligned
+from tpgmm_evaluation.policies.inverse_kinematics import follow_poses
 from tpgmm_evaluation.policies.key_poses import Move, find_moves, minimum_jerk_path
 from tpgmm_evaluation.policies.planned import Observed, SituatedConfig, SituatedPolicy
 from tpgmm_torch import Frame
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.motion.inverse_kinematics import follow_poses
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.robots.robot import Robot
 

@@ -10,10 +10,10 @@ from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.pick_place import SHELF
 from lerobot_env_bimanual.suite.tasks import suite_task
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tpgmm_control.obstacles import Scene
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.exceptions import UnknownNameError
-from tpgmm_torch.obstacles import Scene
 
 TASK, FPS = suite_task("shelf"), 25
 

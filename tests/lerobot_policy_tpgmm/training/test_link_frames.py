@@ -11,11 +11,11 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.policies import grouped
 from tests.support.skills import same
 from tests.support.training import dataset, epoch, fresh, trained
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Canonical, Demonstration, Robot, TaskParameterizedGMM
 from tpgmm_torch.alignment import EventAlignment
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import parse_operator
 

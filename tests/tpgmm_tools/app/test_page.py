@@ -17,11 +17,11 @@ import torch
 from tests.support import browser, skills
 from tests.support.command_line import UPPER_BODY, refusal
 from tests.support.worlds import upper_body
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.tables import demonstrations_to_frame, read_table, write_table
 from tpgmm_tools.app import page
 from tpgmm_torch import Frame, Situation, quaternions
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.persistence import load_model
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tests.support.command_line import output, refusal, run
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_datasets.tables import demonstrations_from_frame, read_table
 from tpgmm_torch import Situation
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.persistence import load_model
 
 

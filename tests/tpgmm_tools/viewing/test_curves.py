@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.support import skills
+from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_tools.viewing.curves import Mark, as_html, motion_marks, motion_panels
 from tpgmm_torch import Hold, Situation, save
-from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.persistence import load_model
 
 

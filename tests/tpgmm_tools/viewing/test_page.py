@@ -13,9 +13,9 @@ from tests.support import browser, skills
 from tests.support.browser import draws, yellow
 from tests.support.recordings import Recording
 from tests.support.worlds import upper_body
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_tools.viewing import LiveView, write_motion
 from tpgmm_torch import Frame, Situation
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DependencyError
 
 pytestmark = pytest.mark.slow

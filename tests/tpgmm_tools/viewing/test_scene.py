@@ -10,11 +10,11 @@ from scipy.stats import chi2
 
 from tests.support import skills
 from tests.support.worlds import upper_body
+from tpgmm_control.obstacles import Scene
+from tpgmm_control.obstacles import Shape as Solid
 from tpgmm_tools.viewing import MotionScene, ellipsoids, parse_shape
 from tpgmm_torch import Frame, Hold, Robot, Situation, quaternions
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.obstacles import Scene
-from tpgmm_torch.obstacles import Shape as Solid
 from tpgmm_torch.robots.urdf import read_urdf
 
 

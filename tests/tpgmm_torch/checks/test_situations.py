@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.support.skills import bottle_model, few_bottles, small_bottle
-from tpgmm_torch import Controller, Frame, Situation, TaskParameterizedGMM, save
+from tpgmm_control import Controller
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, save
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 from tpgmm_torch.persistence import load_model

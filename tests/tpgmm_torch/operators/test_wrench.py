@@ -8,7 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.support.pressing import LEAVE, PRESS, TOUCH, board, slides, wipes, wiping
-from tpgmm_torch import Canonical, Controller, Frame, RelativePosition, Stack
+from tpgmm_control import Controller
+from tpgmm_torch import Canonical, Frame, RelativePosition, Stack
 from tpgmm_torch import TaskParameterizedGMM as Model
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Wrench

@@ -8,13 +8,13 @@ import torch
 
 from tests.support.skills import HANDS, handlings, hands, hands_model
 from tests.support.worlds import upper_body
+from tpgmm_control import rollout
 from tpgmm_torch import (
     Demonstration,
     Frame,
     RelativePosition,
     Robot,
     TaskParameterizedGMM,
-    rollout,
     save,
 )
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError

@@ -8,7 +8,8 @@ import torch
 
 from tests.support.mixtures import CASES, Problem
 from tests.support.skills import HANDLING, handlings, hands_model, waves
-from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM, rollout, save
+from tpgmm_control import rollout
+from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM, save
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import information
 from tpgmm_torch.persistence import load_model

@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from tests.support.skills import bottle_demonstrations, handlings, hands, small_bottle, waves
+from tpgmm_control import Controller, rollout
 from tpgmm_torch import (
-    Controller,
     Frame,
     Situation,
     TaskParameterizedGMM,
     ViaPoints,
     load,
     quaternions,
-    rollout,
     save,
 )
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning

@@ -8,7 +8,8 @@ import torch
 from tests.support.fetching import skill as of
 from tests.support.fetching import skills
 from tests.support.skills import canonical, handlings, hands_model, wave, waves
-from tpgmm_torch import Canonical, Controller, Frame, Hold, SelectOperators, Sequence, rollout
+from tpgmm_control import Controller, rollout
+from tpgmm_torch import Canonical, Frame, Hold, SelectOperators, Sequence
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.structure.fit_parts import fit_parts
 

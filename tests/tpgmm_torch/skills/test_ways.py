@@ -11,7 +11,8 @@ from tests.support.two_ways import (
     fitted,
     reach_of_one_handle,
 )
-from tpgmm_torch import Controller, Frame, Sequence, Situation, ViaPoints, Ways, rollout
+from tpgmm_control import Controller, rollout
+from tpgmm_torch import Frame, Sequence, Situation, ViaPoints, Ways
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 

@@ -17,9 +17,9 @@ import typer
 from tpgmm_tools.arguments.help import HELP_ALL, Command, Help
 
 if TYPE_CHECKING:
+    from tpgmm_control.obstacles import Scene
     from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
-    from tpgmm_torch.obstacles import Scene
     from tpgmm_torch.robots.kinematics import Kinematics
     from tpgmm_torch.skills.skill import Skill
 
@@ -375,8 +375,8 @@ def look(
 
 def scene(file: Path, skill: Skill, visuals: bool, shown: list[Demonstration]) -> Scene:
     """The robot among the obstacles of a ``file``; what is allowed is listed."""
+    from tpgmm_control.obstacles import Scene
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.obstacles import Scene
 
     if not file.is_file():
         raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")

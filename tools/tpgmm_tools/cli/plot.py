@@ -52,8 +52,8 @@ def plot(
     alignment : str
         How episodes are brought onto one clock, as for 'tpgmm fit'.
     """
+    from tpgmm_control.loop.rollout import rollout
     from tpgmm_tools.plotting import figure, legend, plot_candidates, plot_local, save
-    from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.operators.text import format_operator

@@ -74,8 +74,8 @@ def reproduce(
     visuals : bool
         With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
+    from tpgmm_control.loop.rollout import rollout
     from tpgmm_datasets.tables import trajectories_to_frame, write_table
-    from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.exceptions import DataError, UnknownNameError
     from tpgmm_torch.persistence import load_skill
     from tpgmm_torch.skills.situations import at_first

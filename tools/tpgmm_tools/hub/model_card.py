@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from tpgmm_control.loop.rollout import rollout
 from tpgmm_torch import quaternions
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame

@@ -9,11 +9,11 @@ from itertools import cycle
 
 import numpy as np
 
+from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_tools.plotting import operator_labels
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
 

@@ -17,13 +17,13 @@ from typing import Any, Self
 import numpy as np
 import torch
 
+from tpgmm_control.loop.command import Command
+from tpgmm_control.loop.controller import Controller
 from tpgmm_tools.viewing.curves import as_html, motion_marks, motion_panels
 from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
 from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
 from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
-from tpgmm_torch.control.command import Command
-from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame

@@ -11,17 +11,17 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from tpgmm_control.loop.rollout import rollout
+from tpgmm_control.obstacles import Scene
+from tpgmm_control.obstacles import Shape as Obstacle
 from tpgmm_tools.viewing.visuals import OBJECT_COLOR, OBJECT_OPACITY, Color, Shape, whole_body
 from tpgmm_torch import quaternions
-from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.obstacles import Scene
-from tpgmm_torch.obstacles import Shape as Obstacle
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import RobotState
 
@@ -142,7 +142,7 @@ class MotionScene:
         Folder with the files of the robot's meshes.
     fps : float, default=25.0
         Pictures per second.
-    obstacles : tpgmm_torch.obstacles.Scene, optional
+    obstacles : tpgmm_control.obstacles.Scene, optional
         Whose boxes, spheres, cylinders and capsules are drawn, as far as they stand still.
 
     Raises

@@ -1,0 +1,1 @@
+"""Bounded motions: followers of references, and braking."""

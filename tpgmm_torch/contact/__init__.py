@@ -1,5 +1,0 @@
-"""Contact: forces that a skill asks for, reached by moving references."""
-
-from tpgmm_torch.contact.admittance import Admittance, Offsets
-
-__all__ = ["Admittance", "Offsets"]
