@@ -92,7 +92,7 @@ def open_loop(
             done.append(done[-1])
             continue
         seen = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
-        time = torch.as_tensor(now).to(start)
+        time = start.new_tensor(now)
         # what the first step does not record, none does; to ask so takes a third
         with torch.inference_mode(inferring or (k > 0 and not done[0][0].requires_grad)):
             holding = holding.advance(time, joints, seen if moving else None)

@@ -139,7 +139,7 @@ def test_before_the_beginning_and_after_the_end_references_are_held(keep_limits)
 @pytest.mark.parametrize("fusion", [form(), form("covariance", "product")])
 @pytest.mark.parametrize("part", [7, 512])
 def test_candidates_are_those_of_each_tick(case: Case, moves, fusion, part, monkeypatch):
-    monkeypatch.setattr("tpgmm_control.loop.rollout.PART", part)
+    monkeypatch.setattr("tpgmm_torch.skills.reproduction.PART", part)
     problem = Problem.of(case, 3, 2)
     regression, time = problem.regression(fusion=fusion), grid()
     given = situations(problem, time, time, moves=moves)
