@@ -71,11 +71,10 @@ oldest: ## Run the tests of the core with the oldest versions promised, in .venv
 	    --constraint constraints-oldest.txt '.[cli,collada,hub,simulation]' \
 	    'pytest>=8.2' 'pytest-timeout>=2.3' 'hypothesis>=6.100' 'gmr>=2.0' 'packaging>=24.2' 'pytorch-kinematics>=0.10' \
 	    'example-robot-data>=4.1' pin==2.7.0
-	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_datasets tests/tpgmm_tools \
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_control tests/tpgmm_datasets tests/tpgmm_tools \
 	    --continue-on-collection-errors -o filterwarnings=default \
 	    --ignore tests/tpgmm_tools/viewing/test_rerun_recording.py --ignore tests/tpgmm_tools/app \
 	    --ignore tests/tpgmm_datasets/lerobot/test_calibration.py \
-	    --ignore tests/tpgmm_torch/motion/test_inverse_kinematics.py \
 	    --deselect tests/tpgmm_datasets/test_writer.py::test_lerobot_opens_what_is_written_and_the_other_way_round \
 	    --deselect 'tests/tpgmm_datasets/lerobot/test_episodes.py::test_rows_that_are_wrong_are_refused_and_located[nan-nulls-place3]' \
 	    $(PYTEST_ARGS)

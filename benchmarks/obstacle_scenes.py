@@ -30,8 +30,7 @@ from torch import Tensor
 
 from tpgmm_control import Controller
 from tpgmm_control.obstacles import Scene, Shape
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
+from tpgmm_datasets.bottle.skill import HANDS, BottleShaking, bottle_operators
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_torch import Demonstration, Frame, Hold, TaskParameterizedGMM, ViaPoints
 from tpgmm_torch.alignment import DynamicTimeWarping

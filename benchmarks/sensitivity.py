@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_evaluation.regressions.plan import Plan
 from tpgmm_torch import (
     Demonstration,

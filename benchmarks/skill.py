@@ -3,8 +3,7 @@
 from functools import cache
 
 from benchmarks.settings import Settings
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 

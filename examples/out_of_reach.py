@@ -25,8 +25,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_control import Clock, Controller
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.regression.posture import PostureCost, descend

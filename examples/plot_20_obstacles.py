@@ -15,8 +15,7 @@ import torch
 
 from tpgmm_control import Controller
 from tpgmm_control.obstacles import Scene, Shape, find_contacts
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import TaskParameterizedGMM
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.torque import BottleTorqueEnv
 from tpgmm_control.impedance.stiffness import Impedance
-from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import bottle_operators
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, Trajectory
 from tpgmm_torch.alignment import DynamicTimeWarping
 

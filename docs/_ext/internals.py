@@ -43,7 +43,7 @@ NOT_CODE = (
     "tpgmm_tools.arguments",
     "tpgmm_tools.cli",
     "tpgmm_tools.app.command",
-    "tpgmm_vision.commands",
+    "tpgmm_tools.cli",
     "tpgmm_evaluation.command",
     "tpgmm_evaluation.metaworld.__main__",
 )

@@ -11,8 +11,7 @@ import torch
 from matplotlib.figure import Figure
 
 from tpgmm_control import rollout
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_tools.plotting import ORANGE
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping

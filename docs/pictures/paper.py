@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.figures import draw_figures
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
+from tpgmm_tools.paper.figures import draw_figures
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut, slid
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
@@ -38,7 +39,6 @@ from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
-from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
 from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError

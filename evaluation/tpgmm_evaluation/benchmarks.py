@@ -16,16 +16,15 @@ import torch
 import lerobot_env_bimanual  # noqa: F401  registers what gym.make finds
 from lerobot_env_bimanual.aloha.demonstrations import record_aloha
 from lerobot_env_bimanual.aloha.robot import aloha_operators, aloha_robot
+from lerobot_env_bimanual.bottle.carry_and_put import TASK as CARRY
+from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut, slid
 from lerobot_env_bimanual.bottle.measures import FIGURES, PUT_FIGURES, Figure
 from lerobot_env_bimanual.disturbances import CONDITIONS, NOMINAL
 from lerobot_env_bimanual.suite.env import SUITE_CONDITIONS
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets import save_lerobot
-from tpgmm_datasets.bottle.carrying import TASK as CARRY
-from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import HANDS, TASK, BottleShaking
+from tpgmm_datasets.bottle.skill import HANDS, TASK, BottleShaking, bottle_operators
 from tpgmm_torch import (
     Canonical,
     Demonstration,

@@ -18,7 +18,6 @@ from lerobot_policy_tpgmm.settings import ControlConfig, EMConfig, FusionConfig,
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import parse_robot
-from tpgmm_tools.arguments.learning import Choices, parse_parts
 from tpgmm_torch import Hold, TaskParameterizedGMM
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
@@ -27,6 +26,7 @@ from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import decode
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.skills.via_point import ViaPoint
+from tpgmm_torch.structure.choices import Choices, parse_parts
 from tpgmm_torch.structure.select_ways import SelectWays
 
 __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]

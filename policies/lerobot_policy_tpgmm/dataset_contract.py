@@ -15,13 +15,13 @@ from lerobot_policy_tpgmm.eyes import take_over
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
 from tpgmm_datasets.signals import CELL
-from tpgmm_tools.arguments.learning import operators_or_default
 from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.structure.choices import operators_or_default
 
 __all__ = ["adopt", "check_dataset", "declared"]
 

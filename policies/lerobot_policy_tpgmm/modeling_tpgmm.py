@@ -37,8 +37,6 @@ from tpgmm_control.loop.command import Command, Status
 from tpgmm_control.loop.controller import Controller
 from tpgmm_control.obstacles import Scene
 from tpgmm_datasets.lerobot.columns import WRENCH
-from tpgmm_tools.arguments.learning import Choices
-from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import consistent, read_whole, recover
 from tpgmm_torch.exceptions import (
@@ -49,6 +47,7 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     TPGMMError,
 )
+from tpgmm_torch.hub import describe, download, model_card, upload
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
@@ -56,6 +55,7 @@ from tpgmm_torch.persistence import decode, encode, validated
 from tpgmm_torch.robots import Kinematics, Robot
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
+from tpgmm_torch.structure.choices import Choices
 
 __all__ = ["TPGMMPolicy"]
 
@@ -668,7 +668,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``"owner/name"``; made if it does not exist.
         **options
             ``measured``, ``notes``, ``license``, ``private`` and ``token``, as of
-            :func:`tpgmm_tools.hub.push`.
+            :func:`tpgmm_torch.hub.push`.
 
         Returns
         -------

@@ -39,7 +39,7 @@ SHOWN = {
     "tpgmm_torch.alignment": "DynamicTimeWarping LinearTimeNormalization",
     "tpgmm_torch.gaussians": "condition information moment_match product",
     "tpgmm_torch.metrics": "largest_acceleration largest_velocity PoseScorer",
-    "tpgmm_datasets.bottle.sinusoid": "sinusoid",
+    "tpgmm_tools.paper.sinusoid": "sinusoid",
     "tpgmm_torch.operators.text": "format_operator parse_operator",
     "tpgmm_tools.plotting": "figure",
     "tpgmm_torch.quaternions": "exp product",
@@ -48,7 +48,6 @@ SHOWN = {
     "tpgmm_datasets": (
         "FramePose LinkPose Scale describe_lerobot load_lerobot resample save_lerobot trim"
     ),
-    "tpgmm_datasets.bottle.experiment": "bottle_operators",
     "tpgmm_datasets.bottle.skill": "BottleShaking",
 }
 

@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 
 from tests.support import first_skill, recorded_cell
 from tpgmm_datasets import load_lerobot, save_lerobot
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import TASK, BottleShaking
+from tpgmm_datasets.bottle.skill import TASK, BottleShaking, bottle_operators
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.cli.application import app
 from tpgmm_torch import TaskParameterizedGMM, save

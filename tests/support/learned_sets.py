@@ -8,9 +8,9 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
-from tpgmm_datasets.bottle.carrying import CarryAndPut
 from tpgmm_datasets.bottle.skill import BottleShaking, BottleSkill
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_torch import Demonstration, Frame

@@ -19,7 +19,7 @@ from tests.support.robot_zoo import G1_PATH
 from tests.support.skills import bottle_demonstrations, bottle_model, thinned
 from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, LinkPose, Scale, check, load_lerobot, save_lerobot
-from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import bottle_operators
 from tpgmm_datasets.robots import parse_robot
 from tpgmm_datasets.tables import (
     demonstrations_from_frame,

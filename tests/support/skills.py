@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.support.worlds import upper_body
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import (
     Demonstration,
     Frame,

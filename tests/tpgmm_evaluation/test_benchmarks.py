@@ -5,10 +5,10 @@ import pytest
 import torch
 from lerobot.envs import preprocess_observation
 
+from lerobot_env_bimanual.bottle.carry_and_put import slid
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets import load_lerobot
-from tpgmm_datasets.bottle.carrying import slid
 from tpgmm_evaluation import jobs
 from tpgmm_evaluation.benchmarks import CarryBenchmark
 from tpgmm_evaluation.cells import Cell, Results

@@ -19,7 +19,6 @@ from sklearn.base import clone
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_control.obstacles import Scene
 from tpgmm_tools.contacts import contacts
-from tpgmm_tools.hub.model_card import sections
 from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
 from tpgmm_tools.viewing import write_motion
 from tpgmm_tools.viewing.curves import motion_marks, turning_joints
@@ -30,6 +29,7 @@ from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.hub.model_card import sections
 from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
 from tpgmm_torch.operators.base import of_joints
 

@@ -94,17 +94,19 @@ class Frame:
     def to(self, *args: Any, **kwargs: Any) -> Frame:
         """A copy on another device or of another dtype, like :meth:`torch.Tensor.to`."""
         parts = (part.to(*args, **kwargs) for part in (self.position, self.orientation))
-        moved = self._from(*parts)
+        moved = self.from_checked(*parts)
         vars(moved).update(at=self.at)
         return moved
 
     def expand(self, batch: Sequence[int]) -> Frame:
         """The same pose for all of a batch, without copying."""
-        return self._from(self.position.expand(*batch, 3), self.orientation.expand(*batch, 4))
+        return self.from_checked(
+            self.position.expand(*batch, 3), self.orientation.expand(*batch, 4)
+        )
 
     def flatten(self) -> Frame:
         """The leading dimensions as one."""
-        return self._from(self.position.reshape(-1, 3), self.orientation.reshape(-1, 4))
+        return self.from_checked(self.position.reshape(-1, 3), self.orientation.reshape(-1, 4))
 
     @classmethod
     def stack(cls, frames: Sequence[Frame]) -> Frame:
@@ -117,7 +119,7 @@ class Frame:
         """
         steps = [frame.batch_shape for frame in frames if frame.batch_shape]
         batched = [frame.expand(steps[0] if steps else ()) for frame in frames]
-        return cls._from(
+        return cls.from_checked(
             torch.stack([frame.position for frame in batched], dim=-2),
             torch.stack([frame.orientation for frame in batched], dim=-2),
         )
@@ -135,7 +137,7 @@ class Frame:
         lower = lower.to(self.position.device)
         fraction = fraction.to(self.position)
         position, turn = self.position, self.orientation
-        return self._from(
+        return self.from_checked(
             torch.lerp(position[lower], position[lower + 1], fraction[:, None]),
             quaternions.slerp(turn[lower], turn[lower + 1], fraction),
         )
@@ -161,7 +163,7 @@ class Frame:
     def __getitem__(self, index: Any) -> Frame:
         """Select along the leading dimensions."""
         index = (*index, slice(None)) if isinstance(index, tuple) else (index, slice(None))
-        return self._from(self.position[index], self.orientation[index])
+        return self.from_checked(self.position[index], self.orientation[index])
 
     def inverse_transform(self, point: Tensor) -> Tensor:
         """``R^T (x - p)``: points (..., 3) of the base frame, seen from this frame."""
@@ -175,7 +177,7 @@ class Frame:
     def compose(self, inner: Frame) -> Frame:
         """The pose, in the base frame, of what has the pose ``inner`` in this frame."""
         turned = quaternions.product(self.orientation, inner.orientation)
-        return self._from(self.transform(inner.position), turned)
+        return self.from_checked(self.transform(inner.position), turned)
 
     def change(self, other: Frame, distance: float, angle: float) -> Tensor:
         """How far another pose is from this one, in units of a distance and an angle: (...).
@@ -194,13 +196,21 @@ class Frame:
     def seen_from(self, other: Frame) -> Frame:
         """The pose in another frame: ``other.compose(pose.seen_from(other))`` is the pose."""
         turn = quaternions.conjugate(other.orientation)
-        return self._from(
+        return self.from_checked(
             other.inverse_transform(self.position), quaternions.product(turn, self.orientation)
         )
 
     @classmethod
-    def _from(cls, position: Tensor, orientation: Tensor) -> Frame:
-        """Wrap tensors that were checked before."""
+    def from_checked(cls, position: Tensor, orientation: Tensor) -> Frame:
+        """Wrap tensors that are known to fit, without the checks of the constructor.
+
+        Parameters
+        ----------
+        position : Tensor of shape (..., 3)
+            [m].
+        orientation : Tensor of shape (..., 4)
+            Unit quaternions (w, x, y, z).
+        """
         frame = cls.__new__(cls)
         object.__setattr__(frame, "position", position)
         object.__setattr__(frame, "orientation", orientation)

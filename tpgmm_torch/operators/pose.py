@@ -183,7 +183,7 @@ class _Constants:
         self.is_moving = min(seen_from) < len(links)
         self.matrix, self.shape = _bilinear(terms, **options)
         unit = quaternions.identity(**options)
-        self.base = Frame._from(torch.zeros_like(unit[:3]), unit)
+        self.base = Frame.from_checked(torch.zeros_like(unit[:3]), unit)
         self.seen, self.seen_from = index(seen), index(seen_from)
         angular = index(term.gain is not None for term in terms).long()
         self.first = torch.where(angular > 0, self.seen, self.seen_from)

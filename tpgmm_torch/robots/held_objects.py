@@ -76,7 +76,7 @@ def _carried(state: RobotState, pose: Frame, link: str, begin: int, end: int) ->
     instants = torch.arange(len(hand.position), device=hand.position.device)
     there = hand[instants.clamp(max=min(end, len(instants) - 1))].compose(grasp)
     before = (instants <= begin)[:, None]
-    return Frame._from(
+    return Frame.from_checked(
         torch.where(before, pose.position, there.position),
         torch.where(before, pose.orientation, there.orientation),
     )

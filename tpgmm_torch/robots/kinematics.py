@@ -96,7 +96,7 @@ class RobotState:
 
     def pose(self, link: str) -> Frame:
         """Position and orientation of a link."""
-        return Frame._from(self.position(link), self.orientation(link))
+        return Frame.from_checked(self.position(link), self.orientation(link))
 
     def jacobian(self, link: str) -> Tensor:
         """``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""

@@ -246,7 +246,7 @@ class _Fusion(torch.nn.Module):
         names = self._regression.frame_names
         joints, poses = inputs[0], inputs[1 : 1 + 2 * len(names)]
         pairs = zip(names, poses[: len(names)], poses[len(names) :], strict=True)
-        frames = {name: Frame._from(*pose) for name, *pose in pairs}
+        frames = {name: Frame.from_checked(*pose) for name, *pose in pairs}
         time, *parts = inputs[1 + 2 * len(names) :]
         marginals, conditionals = TimeMarginals(*parts[:3]), Conditionals(*parts[3:])
         robot = self._regression.kinematics

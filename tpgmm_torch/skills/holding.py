@@ -498,7 +498,7 @@ def _restarted(late: Tensor | None, where: Tensor) -> Tensor | None:
 
 def _constant(like: Frame, value: float) -> Frame:
     """No pose, but a number in place of its position."""
-    return Frame._from(torch.full_like(like.position, value), like.orientation)
+    return Frame.from_checked(torch.full_like(like.position, value), like.orientation)
 
 
 def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
@@ -527,7 +527,7 @@ def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
         return one if bool(where) else other
     mask = where[..., None]
     position = torch.where(mask, one.position, other.position)
-    return Frame._from(position, torch.where(mask, one.orientation, other.orientation))
+    return Frame.from_checked(position, torch.where(mask, one.orientation, other.orientation))
 
 
 def between(one: Frame, other: Frame, share: Tensor) -> Frame:
@@ -542,7 +542,7 @@ def between(one: Frame, other: Frame, share: Tensor) -> Frame:
     share = share.unsqueeze(-1)
     inner = (other.orientation * one.orientation).sum(-1, keepdim=True)
     turn = quaternions.hemisphere_sign(inner) * other.orientation
-    return Frame._from(
+    return Frame.from_checked(
         one.position + share * (other.position - one.position),
         quaternions.normalize(one.orientation + share * (turn - one.orientation)),
     )

@@ -246,7 +246,7 @@ def _together(
     places = dict(frames)
     for name in holdings[0].held:
         each = [holding.frames[name].expand(batch) for holding in holdings]
-        places[name] = Frame._from(
+        places[name] = Frame.from_checked(
             torch.stack([pose.position for pose in each]),
             torch.stack([pose.orientation for pose in each]),
         )

@@ -245,7 +245,7 @@ class Inputs:
         if smoother is smooth:
             return reading, smooth, self.frames[name]
         values = torch.from_numpy(smoother.pose).to(self.kinematics.lower)
-        return reading, smoother, Frame._from(values[..., :3], values[..., 3:])
+        return reading, smoother, Frame.from_checked(values[..., :3], values[..., 3:])
 
     def _pose_array(self, pose: Any, name: str) -> Floats | None:
         if isinstance(pose, Frame):

@@ -21,8 +21,20 @@ from torch import Tensor
 
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import Demonstration, Frame, Robot, Situation, Trajectory, quaternions
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    RelativeOrientation,
+    RelativePosition,
+    Robot,
+    Situation,
+    Stack,
+    Trajectory,
+    quaternions,
+)
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.operators import Operator
 
 __all__ = [
     "TASK",
@@ -30,6 +42,7 @@ __all__ = [
     "BottleSkill",
     "attached",
     "between",
+    "bottle_operators",
     "either",
     "follow_hands",
     "pose_error",
@@ -440,3 +453,25 @@ def _step(
     residual = error - (jacobian @ rest[..., None])[..., 0]
     solved = torch.linalg.solve(gram, residual[..., None])
     return rest + weights * (weighted.mT @ solved)[..., 0]
+
+
+def bottle_operators(orientation: bool = True) -> list[Operator]:
+    """The two operators of eqs (16), (17): both hands seen from the bottle, and the joints.
+
+    Parameters
+    ----------
+    orientation : bool, default=True
+        False leaves the hands' orientations out, as the dashed lines of figure 4 do.
+
+    Examples
+    --------
+    >>> hands, joints = bottle_operators(orientation=False)
+    >>> hands
+    Stack(RelativePosition(link='l_hand', frame='bottle', held=False, ...
+    """
+    rows: list[Operator] = []
+    for hand in HANDS:
+        rows.append(RelativePosition(hand, "bottle"))
+        if orientation:
+            rows.append(RelativeOrientation(hand, "bottle"))
+    return [Stack(*rows), Canonical()]

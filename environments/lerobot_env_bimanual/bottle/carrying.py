@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.bottle.carry_and_put import SLIDE, TASK, CarryAndPut, slide
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import PUT_FIGURES, Closing, successful
 from lerobot_env_bimanual.bottle.scene import CARRIERS, Snapshot, TrayScene
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.start import Start
-from tpgmm_datasets.bottle.carrying import SLIDE, TASK, CarryAndPut, slide
 from tpgmm_datasets.bottle.skill import FOOT
 from tpgmm_torch import Demonstration, Frame, Situation
 

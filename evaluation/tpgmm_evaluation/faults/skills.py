@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from tpgmm_control.loop.controller import Controller
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, Robot
 from tpgmm_torch import TaskParameterizedGMM as Model

@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from tpgmm_datasets.bottle.carrying import CarryAndPut
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_evaluation.benchmarks import benchmark
 from tpgmm_evaluation.regressions.plan import Measured, Plan
 from tpgmm_torch import (

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from lerobot_env_bimanual.disturbances import NOMINAL
-from tpgmm_datasets.bottle.experiment import BottleExperiment
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
 from tpgmm_evaluation.cells import Results
@@ -25,6 +24,7 @@ from tpgmm_evaluation.compare import compare
 from tpgmm_evaluation.regressions.goldens import GOLDENS
 from tpgmm_evaluation.regressions.plan import Measured, Plan, import_paths
 from tpgmm_evaluation.settings import Settings
+from tpgmm_tools.paper.experiment import BottleExperiment
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import TPGMMError
 

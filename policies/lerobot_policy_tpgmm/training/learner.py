@@ -44,13 +44,13 @@ from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.event_flags import stored_events
-from tpgmm_tools.arguments.learning import Choices, aligner, learn, prepared
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
+from tpgmm_torch.structure.choices import Choices, aligner, learn, prepared
 from tpgmm_torch.training.hold_detection import holding_as_in, with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization

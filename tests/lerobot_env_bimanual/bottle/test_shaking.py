@@ -20,8 +20,8 @@ from lerobot_env_bimanual.bottle.shaking import (
 )
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.start import PUSHED
-from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
+from tpgmm_tools.paper.sinusoid import sinusoid
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 

@@ -10,8 +10,7 @@ from tests.support.lerobot_commands import lerobot
 from tests.support.skills import same
 from tests.support.worlds import upper_body
 from tpgmm_datasets import load_lerobot, save_lerobot
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 

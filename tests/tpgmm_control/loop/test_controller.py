@@ -16,7 +16,7 @@ from tests.support.worlds import OBJECT
 from tpgmm_control.loop.controller import Controller
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_control.sensing.trust import Trust
-from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import bottle_operators
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Frame, Robot, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from ruckig import RuckigError
 
-from tpgmm_control.motion.trajectory_generator import first_part, stopping_range
 from tpgmm_control.motion import trajectory_generator
+from tpgmm_control.motion.trajectory_generator import first_part, stopping_range
 
 BOUNDS = np.array([[1.0, 2.0], [10.0, 20.0], [100.0, 400.0]])
 TICK = np.full(2, 0.01)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import HANDS, PHASES, BottleShaking
+from tpgmm_tools.paper.sinusoid import sinusoid
 from tpgmm_torch import Frame, Situation, quaternions
 
 

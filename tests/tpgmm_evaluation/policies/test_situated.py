@@ -6,6 +6,7 @@ import pytest
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
+from lerobot_env_bimanual.bottle.carry_and_put import slide
 from tests.support.learned_sets import (
     aligned,
     carrying,
@@ -16,7 +17,6 @@ from tests.support.learned_sets import (
     references,
     shaking,
 )
-from tpgmm_datasets.bottle.carrying import slide
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_evaluation.policies.key_poses import find_moves
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy

@@ -17,7 +17,7 @@ from tests.support.skills import (
     waves,
 )
 from tests.support.worlds import OnPoses, OnRobot
-from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import bottle_operators
 from tpgmm_torch import (
     Canonical,
     RelativeOrientation,

@@ -7,8 +7,7 @@ import torch
 from tests.support.planted import HAND, PlantedTask
 from tests.support.skills import few_bottles
 from tests.support.two_ways import TIME, Handles, Obstacle, shown
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import upper_body
+from tpgmm_datasets.bottle.skill import bottle_operators, upper_body
 from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, TaskParameterizedGMM
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError

@@ -167,7 +167,9 @@ def test_gradients_are_finite_where_nothing_is_left_to_turn_and_elsewhere():
             quaternions.exp(torch.tensor(turn).double()),
         )
         start = torch.cat((torch.zeros(3).double(), q)).requires_grad_()
-        found = skill.step(0.0, start, {OBJECT: Frame._from(torch.zeros(3).double(), frame)})
+        found = skill.step(
+            0.0, start, {OBJECT: Frame.from_checked(torch.zeros(3).double(), frame)}
+        )
         gradients = torch.autograd.grad(
             found.joints.square().sum() + found.covariance.sum(), (start, frame)
         )

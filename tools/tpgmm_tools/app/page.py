@@ -19,7 +19,6 @@ from tpgmm_datasets.checks.check import check
 from tpgmm_datasets.robots import ROBOTS
 from tpgmm_datasets.tables import trajectories_to_frame, write_table
 from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
-from tpgmm_tools.arguments.learning import prepared
 from tpgmm_tools.arguments.options import RobotOptions, align
 from tpgmm_tools.cli.application import explain
 from tpgmm_tools.viewing import write_motion
@@ -30,6 +29,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import save
+from tpgmm_torch.structure.choices import prepared
 
 __all__ = ["GENERATED", "UPLOADED", "Skill", "learn", "moved", "page", "places_of", "show"]
 

@@ -334,7 +334,7 @@ def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
     """Bring ``demonstrations`` onto one clock, by the ``method`` for a ``robot``."""
-    from tpgmm_tools.arguments.learning import aligner
+    from tpgmm_torch.structure.choices import aligner
 
     chosen = aligner(method, robot)
     if chosen is None:

@@ -25,6 +25,8 @@ ORDER = (
 LATE = {
     "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
     "app": EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS),
+    "camera": EntryPoint("camera", "tpgmm_tools.cli.camera:app", plugins.COMMANDS),
+    "calibrate": EntryPoint("calibrate", "tpgmm_tools.cli.calibrate:app", plugins.COMMANDS),
 }
 HELP = {
     "fit": "Learn a skill from a LeRobot data set.",

@@ -77,8 +77,8 @@ def demo(
     from rich.console import Console
     from rich.progress import Progress
 
-    from tpgmm_datasets.bottle.experiment import BottleExperiment
     from tpgmm_datasets.bottle.skill import BottleShaking
+    from tpgmm_tools.paper.experiment import BottleExperiment
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)

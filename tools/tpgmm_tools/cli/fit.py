@@ -18,14 +18,6 @@ from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
 from tpgmm_datasets.units import Scale
 from tpgmm_tools.arguments import options
-from tpgmm_tools.arguments.learning import (
-    Choices,
-    aligner,
-    learn,
-    operators_or_default,
-    parse_parts,
-    prepared,
-)  # fmt: skip
 from tpgmm_tools.arguments.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
@@ -34,6 +26,14 @@ from tpgmm_torch.mixture.processes import joined_processes
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import save
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
+from tpgmm_torch.structure.choices import (
+    Choices,
+    aligner,
+    learn,
+    operators_or_default,
+    parse_parts,
+    prepared,
+)  # fmt: skip
 from tpgmm_torch.training.hold_detection import with_holds
 
 __all__ = ["app"]

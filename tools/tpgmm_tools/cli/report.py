@@ -63,9 +63,9 @@ def report(
     from rich.console import Console
     from rich.progress import Progress
 
-    from tpgmm_tools.arguments.learning import prepared
     from tpgmm_tools.report import write_report
     from tpgmm_torch.persistence import load_model
+    from tpgmm_torch.structure.choices import prepared
 
     torch.set_num_threads(1)
     fitted = load_model(model, device="cpu")

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from tpgmm_datasets.bottle.experiment import BottleExperiment
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_tools.paper.experiment import BottleExperiment
 
 pytestmark = pytest.mark.slow
 

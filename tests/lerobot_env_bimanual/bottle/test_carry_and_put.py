@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from tpgmm_datasets.bottle.carrying import PHASES, CarryAndPut, before_sliding, slid, slide
+from lerobot_env_bimanual.bottle.carry_and_put import (
+    PHASES,
+    CarryAndPut,
+    before_sliding,
+    slid,
+    slide,
+)
 from tpgmm_torch import Frame, quaternions
 
 RATE = 25

@@ -7,9 +7,9 @@ import torch
 
 from tests.support.hub_server import local_hub
 from tests.support.skills import small_bottle
-from tpgmm_tools.hub import load, push
 from tpgmm_torch import TaskParameterizedGMM, save
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
+from tpgmm_torch.hub import load, push
 
 
 @pytest.fixture

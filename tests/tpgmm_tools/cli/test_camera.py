@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from tests.support.pdf_pages import pdf_pages
 from tpgmm_tools.cli.application import explain
-from tpgmm_vision.commands.camera import app
+from tpgmm_tools.cli.camera import app
 from tpgmm_vision.targets import target_from
 
 ROOT = Path(__file__).parents[3]

@@ -9,9 +9,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tpgmm_tools.hub.model_card import model_card
 from tpgmm_torch import persistence
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
+from tpgmm_torch.hub.model_card import model_card
 from tpgmm_torch.persistence import FILES, save
 
 __all__ = ["download", "load", "push", "upload"]

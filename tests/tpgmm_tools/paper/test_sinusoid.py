@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tpgmm_datasets.bottle.sinusoid import sinusoid
+from tpgmm_tools.paper.sinusoid import sinusoid
 
 
 @pytest.mark.parametrize("frequency", [0.4, 0.667, 1.9, 7.3])

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from tests.support.rendered_boards import BoardCamera
 from tests.support.simulated_cells import CAMERA, HAND, record, so101_cell
+from tpgmm_tools.cli.calibrate import app
 from tpgmm_vision.cell import camera_content, read_cell, write_cell
-from tpgmm_vision.commands.calibrate import app
 from tpgmm_vision.poses import angle_between
 from tpgmm_vision.targets import Board
 

@@ -10,8 +10,8 @@ from markdown_it import MarkdownIt
 
 from tests.support.skills import small_bottle, waves
 from tests.support.two_ways import Handles, fitted
-from tpgmm_tools.hub import describe
 from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.hub import describe
 from tpgmm_torch.skills.sequence import Sequence
 from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints

@@ -1,6 +1,6 @@
 """Models on the Hugging Face hub, and the card that describes one."""
 
-from tpgmm_tools.hub.model_card import describe, model_card
-from tpgmm_tools.hub.repository import download, load, push, upload
+from tpgmm_torch.hub.model_card import describe, model_card
+from tpgmm_torch.hub.repository import download, load, push, upload
 
 __all__ = ["describe", "download", "load", "model_card", "push", "upload"]

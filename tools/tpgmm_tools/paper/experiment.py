@@ -24,56 +24,33 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_control import rollout
-from tpgmm_datasets.bottle.figures import draw_figures
-from tpgmm_datasets.bottle.sinusoid import sinusoid
-from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, TASK, BottleShaking
+from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, TASK, BottleShaking, bottle_operators
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
+from tpgmm_tools.paper.figures import draw_figures
+from tpgmm_tools.paper.sinusoid import sinusoid
 from tpgmm_torch import (
-    Canonical,
     Demonstration,
     Frame,
     Hold,
-    RelativeOrientation,
-    RelativePosition,
     Situation,
-    Stack,
     TaskParameterizedGMM,
     Trajectory,
     save,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
-from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.training.hold_detection import with_holds
 
-__all__ = ["BottleExperiment", "bottle_operators"]
+__all__ = ["BottleExperiment"]
 
 #: Regularisers of the covariance form that are compared with the information form [rad^2].
 EPSILONS = (1e-6, 1e-4, 1e-2)
 
 
-def bottle_operators(orientation: bool = True) -> list[Operator]:
-    """The two operators of eqs (16), (17): both hands seen from the bottle, and the joints.
-
-    Parameters
-    ----------
-    orientation : bool, default=True
-        False leaves the hands' orientations out, as the dashed lines of figure 4 do.
-
-    Examples
-    --------
-    >>> hands, joints = bottle_operators(orientation=False)
-    >>> hands
-    Stack(RelativePosition(link='l_hand', frame='bottle', held=False, ...
-    """
-    rows: list[Operator] = []
-    for hand in HANDS:
-        rows.append(RelativePosition(hand, "bottle"))
-        if orientation:
-            rows.append(RelativeOrientation(hand, "bottle"))
-    return [Stack(*rows), Canonical()]
+def _say_nothing(text: str) -> None:
+    """Report to nobody."""
 
 
 @dataclass
@@ -105,7 +82,7 @@ class BottleExperiment:
     n_demonstrations: int = 10
     n_situations: int = 50
     seed: int = 0
-    report: Callable[[str], None] = lambda _text: None
+    report: Callable[[str], None] = _say_nothing
     skill: BottleShaking = field(default_factory=BottleShaking)
 
     def run(self) -> dict[str, Any]:

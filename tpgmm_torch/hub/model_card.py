@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_control.loop.rollout import rollout
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Situation
@@ -21,6 +20,7 @@ from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.reproduction import reproduce
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
@@ -33,7 +33,7 @@ MARKUP = re.compile(r"[\\`*\[\]<>!|~&:@$]|\b_|_\b|(?<=www)\.")
 #: Settings that a card has elsewhere, or that are of no interest to others.
 ELSEWHERE = {"n_components", "operators", "robot", "device"}
 USE = """```python
-from tpgmm_tools import hub
+from tpgmm_torch import hub
 
 model = hub.load("{repo_id}")
 ```"""
@@ -153,7 +153,7 @@ def _influence(skill: Regression) -> str:
         return "Not known: it depends on the situation, and what was shown is not kept."
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)
-        [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
+        [trajectory] = reproduce(skill, [situation], candidates=True)
     time = as_array(trajectory.time - trajectory.time[0])
     shares = np.stack([as_array(100 * c.share.mean(-1)) for c in trajectory.candidates], -1)
     spans = np.array_split(np.arange(len(time)), min(SPANS, len(time)))

@@ -1,0 +1,1 @@
+"""The paper's experiment (section IV) and its figures: what ``tpgmm demo`` runs."""

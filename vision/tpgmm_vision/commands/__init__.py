@@ -1,1 +1,0 @@
-"""Commands that ``tpgmm`` finds by entry points."""
