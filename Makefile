@@ -103,7 +103,7 @@ types: $(VENV)/.installed-test ## Check the type hints
 docs: $(VENV)/.installed-test ## Build the documentation; open docs/_build/html/index.html
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
-docs-fast: $(VENV)/.installed-test ## Build the pages alone, without gallery, source and internals; docs/_build/fast
+docs-fast: $(VENV)/.installed-test ## Build the pages alone, without gallery and source; docs/_build/fast
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html -t fast docs docs/_build/fast
 
 check: lint types test docs ## All four

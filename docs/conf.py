@@ -34,9 +34,9 @@ extensions = [
     "numpydoc",
     # our own
     "commands",
-    "internals",
     "notebooks",
     "picturebook",
+    "public_names",
     "sitelinks",
     "suite",
     "thumbnails",
@@ -47,8 +47,7 @@ exclude_patterns = ["_build", "_ext", "pictures", "images", "paper/*", "gallery/
 FAST = tags.has("fast")  # type: ignore[name-defined]  # noqa: F821  # make docs-fast
 if FAST:
     extensions.remove("sphinx.ext.viewcode")
-internals = not FAST
-nitpicky = internals  # names that are not documented are no targets
+nitpicky = True  # see typelinks for names that exist, and are not public
 
 # Pages
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "tasklist"]

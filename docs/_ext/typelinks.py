@@ -7,12 +7,14 @@ from typing import Any
 
 from docutils import nodes
 from numpydoc.xref import DEFAULT_LINKS
+from public_names import PACKAGES, exists
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.environment import BuildEnvironment
 from sphinx.util.nodes import make_refnode
 
+import tpgmm_control
 import tpgmm_datasets
 import tpgmm_torch
 
@@ -31,6 +33,7 @@ def _types(app: Sphinx, config: Config) -> None:
     config.numpydoc_xref_aliases = (
         {name: name for name in DEFAULT_LINKS}  # nobody needs a link from "int"
         | {name: f"tpgmm_torch.{name}" for name in tpgmm_torch.__all__}
+        | {name: f"tpgmm_control.{name}" for name in tpgmm_control.__all__}
         | {name: f"tpgmm_datasets.{name}" for name in tpgmm_datasets.__all__}
         | {"Tensor": "torch.Tensor"}
     )
@@ -58,6 +61,24 @@ def _by_last_part(
         return None
     [(name, entry)] = found.items()
     return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, [text], name)
+
+
+def _not_public(
+    app: Sphinx, env: BuildEnvironment, node: Any, text: nodes.TextElement
+) -> nodes.Element | None:
+    """Let names that exist in this project and are not public stand as text, without a link."""
+    target = node.get("reftarget", "")
+    if node.get("refdomain") != "py" or exists(target):
+        return text if node.get("refdomain") == "py" and target.startswith(PACKAGES) else None
+    first, *rest = target.split(".")
+    for name, module in list(sys.modules.items()):
+        if name.startswith(PACKAGES) and hasattr(module, first):
+            value = getattr(module, first)
+            for part in rest:
+                value = getattr(value, part, None)
+            if value is not None:
+                return text
+    return None
 
 
 def _other_name(app: Sphinx, document: nodes.document) -> None:
@@ -99,4 +120,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("config-inited", _types, priority=100)  # before numpydoc
     app.connect("doctree-read", _other_name)
     app.connect("missing-reference", _by_last_part)
+    app.connect("missing-reference", _not_public, priority=900)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

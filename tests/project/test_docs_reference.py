@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import tpgmm_control
 import tpgmm_datasets
 import tpgmm_torch
 
@@ -25,36 +26,24 @@ def extensions():
     sys.path.remove(str(DOCS / "_ext"))
 
 
-def find(name: str) -> object:
-    """What a dotted name leads to, however deep in a class; None if to nothing."""
-    parts = name.split(".")
-    for split in range(len(parts), 0, -1):
-        try:
-            found = importlib.import_module(".".join(parts[:split]))
-        except ImportError:
-            continue
-        for part in parts[split:]:
-            found = getattr(found, part, None)
-        return found
-    return None
-
-
-def exists(name: str) -> bool:
-    """Whether a dotted name leads to something."""
-    return find(name) is not None
+@pytest.fixture(scope="module")
+def reference():
+    """Return the module that reads the API reference."""
+    return importlib.import_module("public_names")
 
 
 # The API reference
 
 
-@pytest.mark.parametrize("package", [tpgmm_torch, tpgmm_datasets], ids=lambda p: p.__name__)
-def test_pages_by_concept_have_every_name_of_the_package(package):
-    internals = importlib.import_module("internals")
+@pytest.mark.parametrize(
+    "package", [tpgmm_torch, tpgmm_control, tpgmm_datasets], ids=lambda p: p.__name__
+)
+def test_pages_by_concept_have_every_name_of_the_package(package, reference):
     wanted = {f"{package.__name__}.{name}" for name in package.__all__}
-    assert wanted - internals.documented() == set()
+    assert wanted - reference.documented() == set()
 
 
-def test_the_page_of_the_plugins_has_what_its_users_need():
+def test_the_page_of_the_plugins_has_what_its_users_need(reference):
     wanted = {
         "lerobot_policy_tpgmm.configuration_tpgmm.TPGMMConfig",
         "lerobot_policy_tpgmm.modeling_tpgmm.TPGMMPolicy",
@@ -66,36 +55,20 @@ def test_the_page_of_the_plugins_has_what_its_users_need():
         "tpgmm_evaluation.compare.compare",
         "tpgmm_evaluation.settings.Settings",
     }
-    shown = importlib.import_module("internals").documented()
-    assert wanted - shown == set()
+    assert wanted - reference.documented() == set()
 
 
-def test_every_other_public_name_is_on_the_page_of_internals():
-    internals = importlib.import_module("internals")
-    left = internals.internal_names()
-    here = [getattr(importlib.import_module(m), name) for m in left for name in left[m]]
-    shown = {id(value) for value in here} | {id(find(name)) for name in internals.documented()}
-    missing = [
-        f"{module.__name__}.{name}"
-        for module in internals.modules()
-        for name in getattr(module, "__all__", ())
-        if id(getattr(module, name)) not in shown
-    ]
-    assert missing == []
+def test_pages_document_nothing_that_is_gone(reference):
+    assert [name for name in reference.documented() if not reference.exists(name)] == []
 
 
-def test_pages_document_nothing_that_is_gone():
-    internals = importlib.import_module("internals")
-    assert [name for name in internals.documented() if not exists(name)] == []
-
-
-def test_names_that_pages_mention_exist():
+def test_names_that_pages_mention_exist(reference):
     wrong = [
         f"{page.name}: {name}"
         for page in DOCS.rglob("*.md")
         if "_build" not in page.parts
         for name in ROLE.findall(page.read_text(encoding="utf-8"))
-        if name.startswith(("tpgmm_", "lerobot_policy_", "lerobot_env_")) and not exists(name)
+        if name.startswith(reference.PACKAGES) and not reference.exists(name)
     ]
     assert wrong == []
 
@@ -131,11 +104,11 @@ def test_every_formula_is_followed_by_what_computes_and_tests_it():
         assert TIES.match(after), f"no ties below {formula[0]}"
 
 
-def test_ties_lead_to_functions_and_tests_that_exist():
+def test_ties_lead_to_functions_and_tests_that_exist(reference):
     ties = importlib.import_module("ties")
     text = (DOCS / "explanation" / "mathematics.md").read_text(encoding="utf-8")
     for code, tests in TIES.findall(text):
-        assert [name for name in code.split(", ") if not exists(name)] == []
+        assert [name for name in code.split(", ") if not reference.exists(name)] == []
         assert [test for test in tests.split(", ") if not ties.test_exists(test)] == []
 
 

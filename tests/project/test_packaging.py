@@ -21,7 +21,13 @@ ROOT = Path(__file__).parents[2]
 DISTRIBUTIONS = {
     "tpgmm_torch": (
         ROOT,
-        ("tpgmm_torch", "datasets/tpgmm_datasets", "tools/tpgmm_tools", "vision/tpgmm_vision"),
+        (
+            "tpgmm_torch",
+            "control/tpgmm_control",
+            "datasets/tpgmm_datasets",
+            "tools/tpgmm_tools",
+            "vision/tpgmm_vision",
+        ),
     ),
     "lerobot_policy_tpgmm": (ROOT / "policies", ("lerobot_policy_tpgmm",)),
     "lerobot_env_bimanual": (ROOT / "environments", ("lerobot_env_bimanual",)),
@@ -54,7 +60,8 @@ def run(*command: str | Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "container", ["datasets", "tools", "policies", "environments", "evaluation"]
+    "container",
+    ["control", "datasets", "tools", "vision", "policies", "environments", "evaluation"],
 )
 def test_containers_hold_packages_and_no_modules(container):
     assert (ROOT / container).is_dir()
