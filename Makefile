@@ -26,7 +26,7 @@ BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 MEASURE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m tpgmm_evaluation.regressions
 MEASURED := --workers $(WORKERS) $(if $(SMALL),--small) $(if $(ONLY),--only $(ONLY))
 
-.PHONY: help demo compare evidence conditions metaworld bench baseline regressions test oldest newest fuzz mutants lint types docs docs-fast check dist constraints clean
+.PHONY: help demo compare evidence conditions metaworld bench baseline regressions test quality oldest newest fuzz mutants lint types docs docs-fast check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -92,6 +92,10 @@ fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of sav
 
 mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)
+
+quality: lint types ## Check what every commit must keep, in two minutes: style, types, layers, budgets, docstrings
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 tests/project/test_layers.py tests/project/test_budgets.py \
+	    tests/project/test_docs_docstrings.py tests/project/test_docs_reference.py tests/project/test_community_files.py
 
 lint: $(VENV)/.installed-test ## Check style and formatting
 	$(BIN)/ruff check

@@ -1,190 +1,294 @@
 """Sizes of the packages, and of what is in them, stay within their budgets.
 
-Lines of code are lines that are not blank, no comment and no docstring.
+Lines of code are lines that are not blank, no comment and no docstring. Complexity is
+cyclomatic, as radon counts it.
 """
 
 import ast
+import importlib
 import re
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from itertools import chain
 from pathlib import Path
 
 import pytest
 from lerobot.configs import PreTrainedConfig
+from radon.complexity import cc_visit
 
+import tpgmm_control
 import tpgmm_torch
 from lerobot_policy_tpgmm import TPGMMConfig
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {
-    "tpgmm_torch": ("tpgmm_torch",),
-    "tpgmm_datasets": ("datasets",),
-    "lerobot_policy_tpgmm": ("policies",),
-    "tpgmm_tools": ("tools",),
-    "tpgmm_vision": ("vision",),
-    "environments and evaluation": ("environments", "evaluation"),
-    "tests of core, data sets, policy and tools": tuple(
-        f"tests/{name}"
-        for name in ("tpgmm_torch", "tpgmm_datasets", "lerobot_policy_tpgmm", "tpgmm_tools")
-    ),
+FOLDERS = {
+    "tpgmm_torch": "tpgmm_torch",
+    "tpgmm_control": "control",
+    "tpgmm_datasets": "datasets",
+    "tpgmm_vision": "vision",
+    "tpgmm_tools": "tools",
+    "lerobot_policy_tpgmm": "policies",
+    "lerobot_env_bimanual": "environments",
+    "tpgmm_evaluation": "evaluation",
+    "benchmarks": "benchmarks",
+    "tests": "tests",
 }
+#: The layers that a robot runs, held closer than the rest.
+LEARN, RUN = "tpgmm_torch", "tpgmm_control"
+ELSEWHERE = tuple(name for name in FOLDERS if name not in (LEARN, RUN, "tests"))
+MOST_COMPLEX, LONGEST = 10, 60
+PARTICIPLE = re.compile(r"_?[a-z]+(ed|own)")
+NO_VERB = re.compile(r"(What|Which|Where|Of|How|Whether)\b")
 
 BUDGETS = {
-    "lines of tpgmm_torch": 9000,
+    "lines of tpgmm_torch": 9500,
+    "lines of tpgmm_control": 3800,
     "lines of tpgmm_datasets": 4300,
-    "lines of lerobot_policy_tpgmm": 1800,
-    "lines of tpgmm_tools": 2200,
-    "lines of tpgmm_vision": 2200,
-    "lines of environments and evaluation": 8000,
-    "lines of tests of core, data sets, policy and tools": 18000,
-    "functions of the core above complexity 10": 10,
-    "longest function of the core": 70,
-    "most parameters in the core": 16,
-    "named numeric constants of the core": 80,
+    "lines of tpgmm_vision": 2500,
+    "lines of tpgmm_tools": 2900,
+    "lines of lerobot_policy_tpgmm": 1700,
+    "lines of lerobot_env_bimanual": 4400,
+    "lines of tpgmm_evaluation": 3800,
+    "lines of benchmarks": 1300,
+    "lines of tests": 28000,
+    "complex functions of learn": 0,
+    "complex functions of run": 0,
+    "complex functions elsewhere": 20,
+    "longest function of learn": LONGEST,
+    "longest function of run": LONGEST,
+    "most parameters of learn and run": 12,
+    "participles of learn": 0,
+    "participles of run": 0,
+    "participles elsewhere": 0,
+    "first lines without a verb in learn": 0,
+    "first lines without a verb in run": 0,
+    "first lines without a verb elsewhere": 0,
+    "named numeric constants of learn": 60,
+    "named numeric constants of run": 20,
+    "fields of a state of run": 12,
+    "modules behind the estimator": 60,
     "names in tpgmm_torch.__all__": 25,
+    "names in tpgmm_control.__all__": 10,
+    "public names": 200,
     "fields of TPGMMConfig": 30,
     "lines of TaskParameterizedGMM": 250,
     "parameters of TaskParameterizedGMM": 16,
-    "imports of the estimator's module from the core": 16,
-}
-#: PRESENT CEILINGS of what is above its budget still. Lower them with the code; an entry goes
-#: when its budget is reached.
-CEILINGS = {
-    "lines of tpgmm_torch": 16295,
-    "lines of tpgmm_datasets": 4835,
-    "lines of lerobot_policy_tpgmm": 2065,
-    "lines of tpgmm_tools": 3475,
-    "lines of tpgmm_vision": 2845,
-    "lines of environments and evaluation": 10545,
-    "lines of tests of core, data sets, policy and tools": 21200,
-    "longest function of the core": 81,
-    "named numeric constants of the core": 156,
+    "imports of the estimator's module from learn": 16,
 }
 
 
-def code(path: Path) -> int:
-    """Number of lines of code."""
-    text, docstrings = path.read_text(encoding="utf-8"), set()
-    for node in ast.walk(ast.parse(text)):
+@dataclass(frozen=True)
+class Ceiling:
+    """What is above its budget still, and the version in which the budget must be met."""
+
+    value: int
+    until: str
+
+
+#: Lower them with the code; an entry goes when its budget is reached.
+CEILINGS: dict[str, Ceiling] = {}
+
+
+class Source:
+    """A file, read once."""
+
+    def __init__(self, path: Path):
+        self.text = path.read_text(encoding="utf-8")
+        self.tree = ast.parse(self.text)
+
+    @property
+    def lines(self) -> int:
+        """Number of lines of code."""
         documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-        if isinstance(node, documented) and ast.get_docstring(node, clean=False) is not None:
-            docstrings |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
-    return sum(
-        bool(line.strip()) and not line.strip().startswith("#") and number not in docstrings
-        for number, line in enumerate(text.splitlines(), 1)
-    )
+        docstrings: set[int] = set()
+        for node in ast.walk(self.tree):
+            if (
+                isinstance(node, documented)
+                and ast.get_docstring(node, clean=False) is not None
+            ):
+                docstrings |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+        return sum(
+            bool(line.strip()) and not line.strip().startswith("#") and number not in docstrings
+            for number, line in enumerate(self.text.splitlines(), 1)
+        )
+
+    def functions(self) -> Iterator[ast.FunctionDef]:
+        """Functions and methods, however deep."""
+        return (node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef))
+
+    def complex_functions(self) -> Iterator[str]:
+        """Names of functions above radon's complexity 10."""
+        for block in cc_visit(self.text):  # methods stand beside their class
+            if not hasattr(block, "methods") and block.complexity > MOST_COMPLEX:
+                yield f"{block.name}: {block.complexity}"
+
+    def constants(self) -> Iterator[str]:
+        """Names in capitals that the module sets to a number."""
+        for node in self.tree.body:
+            if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+                continue
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                yield from _numbers(target, node.value)
 
 
-BRANCHES = (
-    ast.If, ast.For, ast.While, ast.ExceptHandler, ast.IfExp, ast.comprehension, ast.Assert
-)  # fmt: skip
+def _numbers(target: ast.expr, value: ast.expr) -> Iterator[str]:
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+        for name, part in zip(target.elts, value.elts, strict=True):
+            yield from _numbers(name, part)
+    elif isinstance(target, ast.Name) and re.fullmatch(r"_?[A-Z][A-Z\d_]*", target.id):
+        arithmetic = (ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop)
+        if all(
+            isinstance(node, arithmetic)
+            or (isinstance(node, ast.Constant) and type(node.value) in (int, float))
+            for node in ast.walk(value)
+        ):
+            yield target.id
 
 
-def complexity(function: ast.AST) -> int:
-    """Cyclomatic complexity: 1, and 1 for each branch, loop and further operand."""
-    inner = list(ast.walk(function))
-    operands = sum(len(node.values) - 1 for node in inner if isinstance(node, ast.BoolOp))
-    return 1 + operands + sum(isinstance(node, BRANCHES) for node in inner)
-
-
-def parameters(function: ast.FunctionDef) -> int:
-    """How many, ``self`` and ``cls`` not counted."""
+def _parameters(function: ast.FunctionDef) -> int:
     given = function.args
-    names = [one.arg for one in chain(given.posonlyargs, given.args, given.kwonlyargs)]
-    return len(set(names) - {"self", "cls"})
+    names = {each.arg for each in chain(given.posonlyargs, given.args, given.kwonlyargs)}
+    return len(names - {"self", "cls"})
 
 
-def constants(tree: ast.Module) -> Iterator[str]:
-    """Names in capitals that a module sets to a number."""
-    for node in tree.body:
-        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
-            continue
-        for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-            several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
-            pairs = (
-                zip(target.elts, node.value.elts, strict=True)
-                if several
-                else [(target, node.value)]
-            )
-            for name, value in pairs:
-                named = isinstance(name, ast.Name) and re.fullmatch(
-                    r"_?[A-Z][A-Z\d_]*", name.id
-                )
-                if named and is_number(value):
-                    yield name.id
+def _state_fields(source: Source) -> Iterator[int]:
+    """Yield the number of fields of each dataclass."""
+    for node in ast.walk(source.tree):
+        if isinstance(node, ast.ClassDef) and "dataclass" in ast.unparse(
+            ast.Tuple(node.decorator_list, ast.Load())
+        ):
+            yield sum(isinstance(part, ast.AnnAssign) for part in node.body)
 
 
-def is_number(value: ast.expr) -> bool:
-    """Whether an expression is a number, or computed from numbers alone."""
-    arithmetic = (ast.BinOp, ast.UnaryOp, ast.operator, ast.unaryop)
-    return all(
-        isinstance(node, arithmetic)
-        or (isinstance(node, ast.Constant) and type(node.value) in (int, float))
-        for node in ast.walk(value)
+SOURCES = {
+    name: [Source(path) for path in sorted((ROOT / folder).rglob("*.py"))]
+    for name, folder in FOLDERS.items()
+}
+
+
+def found(measure: str, packages: tuple[str, ...]) -> list[str]:
+    """Functions of packages that break a rule."""
+    every = [source for name in packages for source in SOURCES[name]]
+    if measure == "complex functions":
+        return [name for source in every for name in source.complex_functions()]
+    functions = [function for source in every for function in source.functions()]
+    if measure == "participles":
+        return [each.name for each in functions if PARTICIPLE.fullmatch(each.name)]
+    return [each.name for each in functions if NO_VERB.match(ast.get_docstring(each) or "")]
+
+
+def _public_names() -> int:
+    sys.path.insert(0, str(ROOT / "docs" / "_ext"))
+    try:
+        return len(importlib.import_module("public_names").public_names())
+    finally:
+        sys.path.pop(0)
+
+
+def _modules_behind_the_estimator() -> int:
+    script = (
+        "import sys; from tpgmm_torch import TaskParameterizedGMM;"
+        "ours = [m for name, m in sys.modules.items() if name.startswith('tpgmm_')];"
+        "print(sum(not hasattr(m, '__path__') for m in ours))"
     )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    return int(done.stdout)
 
 
-def class_lines(path: Path, name: str) -> tuple[int, int]:
-    """Lines of code of a class, and parameters of its constructor."""
-    text = path.read_text(encoding="utf-8")
-    [found] = [
-        n for n in ast.parse(text).body if isinstance(n, ast.ClassDef) and n.name == name
+def _estimator() -> Mapping[str, int]:
+    source = Source(ROOT / "tpgmm_torch" / "estimator.py")
+    [definition] = [
+        node
+        for node in source.tree.body
+        if isinstance(node, ast.ClassDef) and node.name == "TaskParameterizedGMM"
     ]
-    lines = text.splitlines()
-    for node in ast.walk(found):
-        documented = isinstance(node, ast.ClassDef | ast.FunctionDef)
-        if documented and ast.get_docstring(node, clean=False) is not None:
-            first, last = node.body[0].lineno, node.body[0].end_lineno
-            lines[first - 1 : last] = [""] * (last - first + 1)
-    own = lines[found.lineno - 1 : found.end_lineno]
-    [made] = [n for n in found.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
-    return sum(bool(x.strip()) and not x.strip().startswith("#") for x in own), parameters(made)
+    [made] = [
+        node
+        for node in definition.body
+        if isinstance(node, ast.FunctionDef) and node.name == "__init__"
+    ]
+    imports = {
+        node.module
+        for node in ast.walk(source.tree)
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("tpgmm_torch.")
+    }
+    return {
+        "lines of TaskParameterizedGMM": source.lines,  # the file is the class
+        "parameters of TaskParameterizedGMM": _parameters(made),
+        "imports of the estimator's module from learn": len(imports),
+    }
 
 
 @pytest.fixture(scope="module")
 def measures() -> Mapping[str, int]:
     """What is measured, by the names of the budgets."""
-    core = [
-        ast.parse(path.read_text(encoding="utf-8"))
-        for path in (ROOT / "tpgmm_torch").rglob("*.py")
-    ]
-    functions = [f for tree in core for f in ast.walk(tree) if isinstance(f, ast.FunctionDef)]
-    lines = {
-        f"lines of {name}": sum(
-            code(path) for folder in folders for path in (ROOT / folder).rglob("*.py")
+    parts = {"learn": (LEARN,), "run": (RUN,), "elsewhere": ELSEWHERE}
+    counted = {
+        f"{measure} {'' if where == 'elsewhere' else preposition}{where}": len(
+            found(measure, packages)
         )
-        for name, folders in PACKAGES.items()
+        for measure, preposition in (
+            ("complex functions", "of "),
+            ("participles", "of "),
+            ("first lines without a verb", "in "),
+        )
+        for where, packages in parts.items()
     }
-    estimator = ROOT / "tpgmm_torch" / "estimator.py"
-    own, given = class_lines(estimator, "TaskParameterizedGMM")
-    imports = {
-        node.module
-        for node in ast.walk(ast.parse(estimator.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("tpgmm_torch.")
+    functions = {
+        where: [each for source in SOURCES[name] for each in source.functions()]
+        for where, name in (("learn", LEARN), ("run", RUN))
+    }
+    longest = {
+        f"longest function of {where}": max(f.end_lineno - f.lineno + 1 for f in several)
+        for where, several in functions.items()
+    }
+    constants = {
+        f"named numeric constants of {where}": sum(len([*s.constants()]) for s in SOURCES[name])
+        for where, name in (("learn", LEARN), ("run", RUN))
     }
     ours = {field.name for field in fields(TPGMMConfig)} - {
         field.name for field in fields(PreTrainedConfig)
     }
-    return lines | {
-        "functions of the core above complexity 10": sum(complexity(f) > 10 for f in functions),
-        "longest function of the core": max(f.end_lineno - f.lineno + 1 for f in functions),
-        "most parameters in the core": max(map(parameters, functions)),
-        "named numeric constants of the core": sum(len(list(constants(tree))) for tree in core),
-        "names in tpgmm_torch.__all__": len(tpgmm_torch.__all__),
-        "fields of TPGMMConfig": len(ours),
-        "lines of TaskParameterizedGMM": own,
-        "parameters of TaskParameterizedGMM": given,
-        "imports of the estimator's module from the core": len(imports),
+    lines = {
+        f"lines of {name}": sum(source.lines for source in sources)
+        for name, sources in SOURCES.items()
     }
+    return {
+        **lines, **counted, **longest, **constants, **_estimator(),
+        "most parameters of learn and run": max(map(_parameters, chain(*functions.values()))),
+        "fields of a state of run": max(n for s in SOURCES[RUN] for n in _state_fields(s)),
+        "modules behind the estimator": _modules_behind_the_estimator(),
+        "names in tpgmm_torch.__all__": len(tpgmm_torch.__all__),
+        "names in tpgmm_control.__all__": len(tpgmm_control.__all__),
+        "public names": _public_names(),
+        "fields of TPGMMConfig": len(ours),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BUDGETS)
 def test_budgets_are_kept(name, measures):
-    limit = CEILINGS.get(name, BUDGETS[name])
+    limit = CEILINGS[name].value if name in CEILINGS else BUDGETS[name]
     assert measures[name] <= limit, f"{name}: {measures[name]}, at most {limit}"
+
+
+def test_everything_measured_has_its_budget(measures):
+    assert measures.keys() == BUDGETS.keys()
 
 
 def test_ceilings_go_when_their_budget_is_reached(measures):
     done = [name for name in CEILINGS if measures[name] <= BUDGETS[name]]
     assert done == [], "delete these from CEILINGS"
+
+
+def test_a_ceiling_names_a_version_that_is_to_come():
+    import importlib.metadata
+
+    from packaging.version import Version
+
+    now = Version(importlib.metadata.version("tpgmm-torch"))
+    overdue = [name for name, ceiling in CEILINGS.items() if Version(ceiling.until) <= now]
+    assert overdue == [], "their budgets must be met in this version"

@@ -40,8 +40,42 @@ def test_issue_templates_ask_in_a_form_that_can_be_shown(name):
         assert field["id"] and field["attributes"]["label"]
 
 
-def test_commands_that_are_named_exist():
-    targets = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    for name in ("SECURITY.md", "CODE_OF_CONDUCT.md"):
-        asked = re.findall(r"`make ([a-z-]+)`", (ROOT / name).read_text(encoding="utf-8"))
-        assert set(asked) <= set(targets)
+TARGETS = re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    "name", ["AGENTS.md", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md", "SECURITY.md"]
+)
+def test_commands_that_are_named_exist(name):
+    asked = re.findall(r"`make ([a-z-]+)", (ROOT / name).read_text(encoding="utf-8"))
+    assert set(asked) <= set(TARGETS)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / ".github/workflows").glob("*.yml")), ids=str)
+def test_workflows_call_targets_that_exist(path):
+    jobs = yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"]
+    commands = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
+    called = [
+        word
+        for command in commands
+        for names in re.findall(r"^make ((?:[a-z-]+ )+|[a-z-]+)", command, re.MULTILINE)
+        for word in names.split()
+    ]
+    assert set(called) <= set(TARGETS)
+    assert all(0 < job["timeout-minutes"] <= 90 for job in jobs.values())
+
+
+def test_the_map_fits_one_screen_and_names_folders_that_exist():
+    text = (ROOT / "AGENTS.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    folders = re.findall(r"^\| `([a-z]+)/`", text, re.MULTILINE)
+    assert len(folders) > 6
+    assert all((ROOT / folder).is_dir() for folder in folders)
+    for path in re.findall(r"`((?:docs|tests|evaluation)/[\w/]+\.(?:md|py))`", text):
+        assert (ROOT / path).is_file() or "PACKAGE" in path, path
+
+
+def test_hooks_before_a_commit_run_what_quality_runs():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))
+    entries = [hook["entry"] for repo in hooks["repos"] for hook in repo["hooks"]]
+    assert "make quality" in entries

@@ -49,7 +49,7 @@ def run(*command: str | Path) -> str:
         capture_output=True,
         text=True,
         cwd=ROOT,
-        env=os.environ | {"HF_HUB_OFFLINE": "1"},
+        env=os.environ | {"HF_HUB_OFFLINE": "1", "GITHUB_REPOSITORY": "owner/name"},
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
@@ -112,6 +112,12 @@ def test_wheel_describes_itself(wheel):
     assert about == {"METADATA", "WHEEL", "RECORD", "licenses/LICENSE"}
     assert f"\nVersion: {PROJECT['version']}\n" in metadata
     assert "\nDescription-Content-Type: text/markdown\n" in metadata
+
+
+def test_wheel_of_the_toolkit_says_where_its_repository_is(wheel):
+    distribution, _, metadata = wheel
+    if distribution == "tpgmm_torch":
+        assert "\nProject-URL: Homepage, https://github.com/owner/name\n" in metadata
 
 
 def test_command_tpgmm_leads_to_a_function():
