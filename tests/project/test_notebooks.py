@@ -156,7 +156,7 @@ def test_pip_installs_the_archive_that_a_hosted_notebook_names(
     assert requirement == f"tpgmm-torch[cli] @ {address}archive/0123abc.tar.gz"
     (tmp_path / "archive").mkdir()
     with tarfile.open(tmp_path / "archive" / "0123abc.tar.gz", "w:gz") as archive:
-        for path in ("LICENSE", "README.md", "pyproject.toml", *PACKAGES):
+        for path in ("LICENSE", "README.md", "hatch_build.py", "pyproject.toml", *PACKAGES):
             archive.add(ROOT / path, f"tpgmm-0123abc/{path}")
     here = requirement.replace(address, f"{tmp_path.as_uri()}/")
     options = ("--no-deps", "--no-index", "--no-build-isolation", "--target", tmp_path / "site")
