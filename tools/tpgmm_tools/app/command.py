@@ -61,10 +61,10 @@ def page(
     if dataset is None and kinematics is not None:
         raise DataError("--robot describes DATASET, and none is given")
 
-    def recorded() -> Recorded:
+    def read_recorded() -> Recorded:
         return data.read(str(dataset), kinematics), kinematics
 
-    blocks = built({} if dataset is None else {dataset: recorded})
+    blocks = built({} if dataset is None else {dataset: read_recorded})
     from gradio.themes import Default
 
     _, url, _ = blocks.launch(

@@ -14,6 +14,7 @@ from tpgmm_tools.arguments import options
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo
     from tpgmm_datasets.lerobot.layout import Episode
+    from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
@@ -44,9 +45,9 @@ def info(
     description = describe_lerobot(path)
     for name, value in _summary(description).items():
         typer.echo(f"{name:<10} {value}")
-    rows = [("column", "type", "value", "unit", "from", "to")]
-    rows += [row for column in description.columns for row in _rows(column)]
-    typer.echo(f"\n{in_columns(rows)}")
+    head = ("column", "type", "value", "unit", "from", "to")
+    rows = [row for column in description.columns for row in _rows(column)]
+    typer.echo(f"\n{in_columns([head, *rows])}")
     for problem in summed_up(description.problems):
         typer.echo(f"problem: {problem}")
 
@@ -72,13 +73,7 @@ def check(
         Fail for what is only unlikely, too.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import (
-        CHECKS,
-        DatasetError,
-        DatasetWarning,
-        UnknownUnitsError,
-        summed_up,
-    )
+    from tpgmm_datasets.errors import CHECKS, summed_up
 
     description = describe_lerobot(path)
     problems = [problem for problem in description.problems if problem.check != "joints"]
@@ -87,12 +82,23 @@ def check(
     if problems:
         raise typer.Exit(1)
     # all problems in one go, not the first
-    recording = data.opened(path, described.read(), relax=CHECKS)
+    recording = data.open(path, described.read(), relax=CHECKS)
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
     if description.tracked:
-        typer.echo(f"tracked: {_tracked(description)}")
+        typer.echo(f"tracked: {_sum_up_tracking(description)}")
+    findings = _check_plausibility(recording, strict)
+    for kind, finding in findings:
+        typer.echo(f"{kind}: {finding}")
+    if any(strict or kind == "error" for kind, _ in findings):
+        raise typer.Exit(1)
+
+
+def _check_plausibility(recording: Recording, strict: bool) -> list[tuple[str, object]]:
+    """Return errors, and what is unlikely; exit where units are not known."""
+    from tpgmm_datasets.errors import DatasetError, DatasetWarning, UnknownUnitsError
+
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
@@ -101,15 +107,10 @@ def check(
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
     except DatasetError as error:
-        typer.echo(f"error: {error}")
-        raise typer.Exit(1) from error
-    bad = [str(one.message) for one in caught if issubclass(one.category, DatasetWarning)]
-    for problem in bad:
-        typer.echo(f"error: {problem}")
-    for finding in report:
-        typer.echo(f"{'error' if finding.impossible else 'unlikely'}: {finding}")
-    if bad or report.errors() or (strict and len(report)):
-        raise typer.Exit(1)
+        return [("error", error)]
+    bad = [one.message for one in caught if issubclass(one.category, DatasetWarning)]
+    found = [("error" if one.impossible else "unlikely", one) for one in report]
+    return [*(("error", message) for message in bad), *found]
 
 
 @options.command(app, "tpgmm dataset plot out/demo/dataset --out out/dataset.png")
@@ -217,7 +218,7 @@ def convert(
     task : str
         What is done, for all. Default: each episode's own.
     """
-    recording = data.opened(source, described.read())
+    recording = data.open(source, described.read())
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints
     kept = demonstrations[0].joint_names or ()
@@ -297,8 +298,6 @@ def track(
     joint_name : ``STORED=JOINT``
         The robot's name of a stored joint, as of 'tpgmm fit', repeatable.
     """
-    from rich.progress import Progress
-
     from tpgmm_torch.checks.report import in_columns
     from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_vision.episodes.report import table
@@ -309,13 +308,8 @@ def track(
     reading = {
         key: given[key] for key in ("units", "calibration", "joint_names") if key in given
     }
-    with Progress() as bar:
-        task = bar.add_task("tracking")
-
-        def advance(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        reports = track_lerobot(path, out, cell, robot, **reading, progress=advance)
+    with options.show_progress("tracking") as progress:
+        reports = track_lerobot(path, out, cell, robot, **reading, progress=progress)
     typer.echo(in_columns(table(reports)))
     known = {str(one.index): [t.known.mean() for t in one.tracks.values()] for one in reports}
     if unknown := [index for index, shares in known.items() if min(shares) < 0.95]:
@@ -329,7 +323,7 @@ def track(
 
 
 def _tasks(episodes: Sequence[Episode]) -> list[str]:
-    """The task of each episode, of which it must have one."""
+    """Return the task of each episode, which must have one."""
     from tpgmm_torch.exceptions import DataError
 
     for episode in episodes:
@@ -364,27 +358,23 @@ def _summary(description: DatasetInfo) -> dict[str, object]:
         "joints": description.joints or "not found",
         "frames": ", ".join(description.frames) or "none found",
         "events": ", ".join(description.events) or "none found",
-        "tracked": _tracked(description),
+        "tracked": _sum_up_tracking(description),
         "problems": len(description.problems) or "none",
     }
 
 
-def _tracked(description: DatasetInfo) -> str:
-    """How often objects were seen in the pictures."""
+def _sum_up_tracking(description: DatasetInfo) -> str:
+    """Say how often objects were seen in the pictures."""
     shares = description.tracked.items()
     found = [f"{name} seen in {a:.0%}, known in {b:.0%} of all rows" for name, (a, b) in shares]
     return ", ".join(found) or "none"
 
 
-def _rows(column: ColumnInfo) -> Iterator[tuple[str, str, str, str, str, str]]:
-    """A row per value; the key stands in the first."""
+def _rows(column: ColumnInfo) -> Iterator[tuple[str, ...]]:
+    """Make a row for each value; the key stands in the first."""
     width = len(column.low or column.names or column.units or (0,))
-    for i in range(width):
-        yield (
-            column.key if i == 0 else "",
-            column.dtype if i == 0 else "",
-            column.names[i] if column.names else str(i),
-            column.units[i] if column.units else "",
-            f"{column.low[i]:.4g}" if column.low else "",
-            f"{column.high[i]:.4g}" if column.high else "",
-        )
+    names = column.names or [str(i) for i in range(width)]
+    low, high = ([f"{x:.4g}" for x in ends or ()] for ends in (column.low, column.high))
+    columns = (some or [""] * width for some in (names, column.units, low, high))
+    for i, values in enumerate(zip(*columns, strict=False)):
+        yield (column.key, column.dtype, *values) if i == 0 else ("", "", *values)
