@@ -62,7 +62,7 @@ def test_a_table_becomes_a_moving_picture_and_files(table, tmp_path):
     with zipfile.ZipFile(model) as archive:
         archive.extractall(tmp_path)
     again = load_model(tmp_path / "model")
-    there = page.moved(situation, [place])
+    there = page.move_objects(situation, [place])
     [same] = rollout(again.skill, [there], bounds="robot", blend=1.0)
     columns = read_table(motion)[list(same.joint_names)]
     np.testing.assert_allclose(columns, same.joints, atol=1e-9)
@@ -108,7 +108,7 @@ def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwa
 def test_objects_are_turned_about_the_vertical_through_them():
     lying = Frame([0.1, 0.2, 0.3], quaternions.exp(torch.tensor([0.0, np.pi / 2, 0.0])))
     situation = Situation([0.0], {"cup": lying, "belt": Frame(np.zeros((5, 3)))})
-    frame = page.moved(situation, [("cup", "0.4", 0, 1, 90)]).frames["cup"]
+    frame = page.move_objects(situation, [("cup", "0.4", 0, 1, 90)]).frames["cup"]
     np.testing.assert_allclose(frame.position, (0.4, 0, 1))
     point = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -116,10 +116,10 @@ def test_objects_are_turned_about_the_vertical_through_them():
     np.testing.assert_allclose(frame.transform(point) - frame.position, expected, atol=1e-12)
     for place in ((1, 2, 3), (1, 2, 3, None), (1, 2, 3, "a"), (1, 2, 3, np.nan)):
         with pytest.raises(DataError, match="cup: a place is x, y, z in metres and a turn"):
-            page.moved(situation, [("cup", *place)])
+            page.move_objects(situation, [("cup", *place)])
     for name in ("belt", "mug"):
         with pytest.raises(UnknownNameError, match=rf"{name}.*cup"):
-            page.moved(situation, [(name, 0, 0, 0, 0)])
+            page.move_objects(situation, [(name, 0, 0, 0, 0)])
 
 
 @pytest.fixture(scope="module")

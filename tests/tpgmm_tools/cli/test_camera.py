@@ -50,4 +50,7 @@ main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr == "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
+    assert (
+        done.stderr
+        == "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
+    )

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from tpgmm_control.loop.command import Command
 from tpgmm_control.loop.controller import Controller
 from tpgmm_tools.viewing.curves import as_html, motion_marks, motion_panels
 from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
 from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
-from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -242,10 +240,10 @@ def _add_node(scene: Any, path: str, node: Node, size: float, dragged: Dragged |
 
 
 def _add_solid(scene: Any, path: str, shape: Shape) -> None:
-    turn = torch.from_numpy(np.ascontiguousarray(shape.pose[:3, :3]))
+    pose = shape.placement
     placed: dict[str, Any] = {
-        "position": shape.pose[:3, 3],
-        "wxyz": quaternions.from_matrix(turn).numpy(),
+        "position": pose[:3],
+        "wxyz": pose[3:],
         "color": shape.color,
         "opacity": None if shape.opacity >= 1 else shape.opacity,
     }
@@ -454,8 +452,8 @@ class LiveView:
             numbers = [str(index) for index in range(len(self._situations))]
             chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])
             chosen.on_update(lambda event: self.show(int(event.target.value)))
-        self._slider.on_update(self._slid)
-        self._run.on_update(self._switched)
+        self._slider.on_update(self._seek)
+        self._run.on_update(self._switch_controller)
 
     def _step_back(self, client: Any) -> None:
         """See both arms on a page that is higher than wide, as on a phone."""
@@ -468,11 +466,11 @@ class LiveView:
         if not self._dragged:
             self.move_frame(name, Frame(event.target.position, event.target.wxyz))
 
-    def _slid(self, event: Any) -> None:
+    def _seek(self, event: Any) -> None:
         if event.client is not None:  # moved by hand, not by the clock
             self._play.value, self.clock = False, event.target.value
             self.stop_controller()
 
-    def _switched(self, event: Any) -> None:
+    def _switch_controller(self, event: Any) -> None:
         if event.client is not None:
             (self.start_controller if event.target.value else self.stop_controller)()
