@@ -212,7 +212,7 @@ def plot_joints(
     """
     names = list(motion.joint_names or (f"joint_{i}" for i in range(motion.joints.shape[1])))
     chosen = names if joints is None else list(joints)
-    if unknown := [name for name in chosen if name not in names]:
+    if unknown := sorted({*chosen} - {*names}):
         raise UnknownNameError("joint", unknown[0], "the motion", names)
     panels = figure(len(chosen), "", height=1.1).axes if axes is None else list(axes)
     for name, panel in zip(chosen, panels, strict=True):

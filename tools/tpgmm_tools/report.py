@@ -39,15 +39,6 @@ __all__ = ["LeftOut", "leave_one_out", "write_report"]
 DRAWN = 4
 #: A joint is near its limit within this share of its range, or of its speed.
 NEAR = 0.1
-STYLE = """
-:root{color-scheme:light dark}
-body{font:16px/1.5 system-ui,sans-serif;max-width:60em;margin:auto;padding:1em}
-table{border-collapse:collapse;display:block;overflow-x:auto;margin:1em 0}
-.n,td:first-child{white-space:nowrap}
-td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #8884}
-img,iframe{width:100%;border:0;background:#fff}div{overflow-x:auto}img{min-width:40em}
-iframe{height:32em}@media (max-width:40em){iframe{height:48em}}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +189,10 @@ def write_report(
         "How it was learned": learning,
     }
     text = "".join(f"<h2>{name}</h2>{part}" for name, part in parts.items() if part)
+    style = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
     page = (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f'<meta name=viewport content="width=device-width"><style>{STYLE}</style>'
+        f'<meta name=viewport content="width=device-width"><style>\n{style}</style>'
         f"<h1>{html.escape(title)}</h1>{text}</html>"
     )
     with replacing(path) as new:
@@ -219,8 +211,8 @@ def _quantiles(
     for one in left_out:
         for place, errors in one.errors.items():
             at.setdefault(place[first:], []).append(errors)
-    for place, pairs in at.items():
-        yield place, np.quantile(pairs, [0.5, 0.9], axis=0), len(pairs)
+    for where, pairs in at.items():
+        yield where, np.quantile(pairs, [0.5, 0.9], axis=0), len(pairs)
 
 
 def _glance(left_out: Sequence[LeftOut]) -> Iterator[str]:

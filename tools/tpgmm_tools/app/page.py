@@ -120,14 +120,13 @@ def learn(
     try:
         with _collect_remarks() as remarks:
             if source == UPLOADED:
-                described = robot_file if robot == ROBOT_FILE else robot
-                given = [described] if described and described != NO_ROBOT else None
+                described = {ROBOT_FILE: robot_file, NO_ROBOT: None}.get(robot, robot)
+                given = None if described is None else [described]
                 kinematics = RobotOptions(given, _names(links)).read()
                 read = read_uploads(files or (), kinematics, _names(frames))
             else:
-                read, kinematics = (
-                    generate_bottle if source == GENERATED else (more or {})[source]
-                )()
+                known: dict[str, Callable[[], Recorded]] = {GENERATED: generate_bottle}
+                read, kinematics = (known | dict(more or {}))[source]()
             model = _fit(read, kinematics, int(n_components))
     except Exception as error:
         return None, _refuse(error)

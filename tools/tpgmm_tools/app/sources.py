@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Sequence
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -56,16 +57,17 @@ def read_uploads(
         If these are no such files.
     """
     paths = sorted(path for path in map(Path, files) if not path.name.startswith("."))
-    kinds = {path.suffix.lower() for path in paths}
-    if kinds == {".zip"} and len(paths) == 1:
+    suffixes = [path.suffix.lower() for path in paths]
+    if suffixes == [".zip"]:
         return _read_archive(paths[0], robot, parse_frames(frames) or {})
-    if not paths or not kinds <= {".csv", ".parquet"}:
+    if not paths or not {*suffixes} <= {".csv", ".parquet"}:
         names = ", ".join(path.name for path in paths) or "no file"
         raise DataError(
             "give one .zip of a LeRobot data set's folder, or tables (.csv, .parquet); got "
             f"{names}"
         )
-    return [one for path in paths for one in demonstrations_from_frame(read_table(path))]
+    tables = map(demonstrations_from_frame, map(read_table, paths))
+    return list(chain.from_iterable(tables))
 
 
 def _read_archive(

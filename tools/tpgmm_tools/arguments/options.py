@@ -159,7 +159,7 @@ class RobotOptions:
         from tpgmm_torch.exceptions import DataError
         from tpgmm_torch.robots.tracked_poses import Poses
 
-        parts = self.link or self.robot_joint or self.coordinate
+        parts = any((self.link, self.robot_joint, self.coordinate))
         if self.poses and (self.robot or parts):
             raise DataError("--poses are instead of --robot and its links and joints")
         if self.poses:

@@ -13,12 +13,11 @@ from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
     from tpgmm_datasets.reader import Recording
-    from tpgmm_vision.calibration.cell_calibration import CellCalibration
+    from tpgmm_vision.calibration.cell_calibration import CellCalibration, Mount
     from tpgmm_vision.cell import CellCamera
 
 __all__ = ["app"]
 
-Contents = dict[str, dict[str, Any]]
 
 app = typer.Typer(help="Calibrate cameras and cells.", add_completion=False)
 
@@ -123,20 +122,15 @@ def cell(
         Where pictures with the corners that were seen and expected go.
     """
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_vision.calibration.cell_calibration import Mount, calibrate_cell
+    from tpgmm_vision.calibration.cell_calibration import calibrate_cell
     from tpgmm_vision.cell import read_cell, write_cell
-    from tpgmm_vision.targets import target_from
 
     before = read_cell(cell)
     cameras = _choose_cameras(before.cameras, camera)
-    hands, checks = _read_targets(hand, check)
-    mounts = {
-        name: Mount(target_from(entry, name), name if name in hands else None)
-        for name, entry in {**checks, **hands}.items()
-    }
-    carriers = {one.link for one in cameras.values() if one.link}
-    links = sorted(carriers.union(hands, described.link or ()))
-    robot = replace(described, link=links).read()
+    mounts, checks = _read_mounts(hand, check)
+    carriers = [one.link for one in cameras.values()] + [one.link for one in mounts.values()]
+    links = {*filter(None, carriers), *(described.link or ())}
+    robot = replace(described, link=sorted(links)).read()
     if robot is None or not cameras or not mounts:
         raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
                         "(tpgmm calibrate camera) and tags in its hand (--hand)")  # fmt: skip
@@ -198,19 +192,29 @@ def _choose_cameras(
     return {name: known[name] for name in chosen or known}
 
 
-def _read_targets(hand: Sequence[str] | None, check: Sequence[str] | None) -> list[Contents]:
-    """Return targets in hands, and those that stand still, as a cell file describes them."""
+def _read_mounts(
+    hand: Sequence[str] | None, check: Sequence[str] | None
+) -> tuple[dict[str, Mount], dict[str, Any]]:
+    """Return the targets of --check and --hand, and the cell file's entries of the former."""
     from tpgmm_torch.exceptions import DataError
+    from tpgmm_vision.calibration.cell_calibration import Mount
+    from tpgmm_vision.targets import target_from
 
-    given = [[_target(one) for one in several or ()] for several in (hand, check)]
-    names = [name for several in given for name, _ in several]
+    checks, hands = (dict(map(_target, texts or ())) for texts in (check, hand))
+    names = [text.partition("=")[0] for text in (*(hand or ()), *(check or ()))]
     if len({*names}) < len(names):
         raise DataError(f"--hand and --check name each target once, got {names}")
-    return [dict(several) for several in given]
+    mounts = {name: Mount(target_from(entry, name), None) for name, entry in checks.items()}
+    for link, entry in hands.items():
+        mounts[link] = Mount(target_from(entry, link), link)
+    return mounts, checks
 
 
 def _enter_result(
-    content: dict[str, Any], result: CellCalibration, checks: Contents, joints: Sequence[str]
+    content: dict[str, Any],
+    result: CellCalibration,
+    checks: dict[str, Any],
+    joints: Sequence[str],
 ) -> None:
     """Enter what was found into the content of a cell file."""
     from tpgmm_vision.cell import pose_content

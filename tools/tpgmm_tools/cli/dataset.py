@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import chain, repeat, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -373,8 +374,8 @@ def _sum_up_tracking(description: DatasetInfo) -> str:
 def _rows(column: ColumnInfo) -> Iterator[tuple[str, ...]]:
     """Make a row for each value; the key stands in the first."""
     width = len(column.low or column.names or column.units or (0,))
-    names = column.names or [str(i) for i in range(width)]
+    names = column.names or map(str, range(width))
     low, high = ([f"{x:.4g}" for x in ends or ()] for ends in (column.low, column.high))
-    columns = (some or [""] * width for some in (names, column.units, low, high))
-    for i, values in enumerate(zip(*columns, strict=False)):
-        yield (column.key, column.dtype, *values) if i == 0 else ("", "", *values)
+    keys = chain([(column.key, column.dtype)], repeat(("", "")))
+    rows = zip_longest(names, column.units or (), low, high, fillvalue="")
+    yield from ((*key, *values) for key, values in zip(keys, rows, strict=False))

@@ -308,20 +308,24 @@ def _sum_up_recording(
     places = (f"{name} ({_place(one)})" for name, one in assembly.frames.items())
     stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]
     found = [f"{name} (looked for)" for name in assembly.events]
-    holds = [
-        str(replace(one, begin=round(one.begin, 2), end=round(one.end, 2)))
-        for one in kept[0].holds or ()
-    ]
-    counts = bool(holds) and default and len(kept[0].frames) > 1
     lines = {
         "joints": f"{kept[0].n_joints} of {joints.feature.key}: {', '.join(names)}",
         "units": _sum_up_units(joints, names),
         "links": links + " (its hands; --link names others)" * bool(links and not named),
         "frames": ", ".join(places),
         "events": ", ".join((*stored, *found)),
-        "held": ", ".join(holds) + " (put onto an object: --operator auto)" * counts,
+        "held": _sum_up_holds(kept[0], default),
     }
     return {name: text or "none" for name, text in lines.items()}
+
+
+def _sum_up_holds(shown: Demonstration, default: bool) -> str:
+    """Sum up what is held, and what may follow from it for the operators."""
+    rounded = [
+        replace(h, begin=round(h.begin, 2), end=round(h.end, 2)) for h in shown.holds or ()
+    ]
+    counts = bool(rounded) and default and len(shown.frames) > 1
+    return ", ".join(map(str, rounded)) + " (put onto an object: --operator auto)" * counts
 
 
 def _place(frame: Any) -> str:

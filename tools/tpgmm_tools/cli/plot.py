@@ -107,17 +107,16 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
             return [names[column] for column in operator.columns(names)]
         case kinds.AbsolutePosition() | kinds.RelativePosition():
             return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
-        case kinds.Wrench():
-            axes = ["xyz"[axis] for axis in operator.axes or ()]
-            forces = [f"{operator.link}\nforce {axis} [N]" for axis in axes]
-            return [*forces, f"{operator.link}\ncontact"]
-    return _orientation_names(operator, kinematics)
+    return _other_names(operator, kinematics)
 
 
-def _orientation_names(operator: Any, kinematics: Kinematics) -> list[str]:
-    """Label parts of rotation vectors and quaternions, and number what else there is."""
+def _other_names(operator: Any, kinematics: Kinematics) -> list[str]:
+    """Label forces, parts of rotation vectors and quaternions, and number all else."""
     from tpgmm_torch import operators as kinds
 
+    if isinstance(operator, kinds.Wrench):
+        forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+        return [*forces, f"{operator.link}\ncontact"]
     if operator.rotation_vector_starts(kinematics) == (0,):
         return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
     if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):

@@ -78,7 +78,6 @@ def reproduce(
         With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
     from tpgmm_control.loop.rollout import rollout
-    from tpgmm_datasets.tables import trajectories_to_frame, write_table
     from tpgmm_torch.exceptions import DataError, UnknownNameError
     from tpgmm_torch.persistence import load_skill
     from tpgmm_torch.skills.via_points import ViaPoints
@@ -101,9 +100,7 @@ def reproduce(
             f"{error}. Say where it is in the data set, as to 'tpgmm fit': --frame "
             f"{error.name}=FEATURE or --frame {error.name}=LINK@EVENT"
         ) from error
-    pairs = zip(trajectories, wanted, strict=True)
-    frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
-    write_table(trajectories_to_frame(trajectories, frames), out)
+    _write(trajectories, wanted, out)
     descriptions = [_describe(one, kinematics) for one in trajectories]
     for number, text in [*enumerate(descriptions), *enumerate(_choose_ways(skill, wanted))]:
         typer.echo(f"{number:>4}  {text}")
@@ -111,6 +108,14 @@ def reproduce(
     if obstacles is not None:
         scene = options.read_obstacles(obstacles, skill, visuals, shown)
         _report_contacts(scene, trajectories, wanted, skill.holds)
+
+
+def _write(motions: list[Trajectory], situations: list[Situation], out: Path) -> None:
+    from tpgmm_datasets.tables import trajectories_to_frame, write_table
+
+    pairs = zip(motions, situations, strict=True)
+    frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
+    write_table(trajectories_to_frame(motions, frames), out)
 
 
 def _choose_ways(skill: Any, situations: list[Situation]) -> Iterator[object]:

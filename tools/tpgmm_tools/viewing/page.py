@@ -33,27 +33,6 @@ __all__ = ["LiveView", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
-#: The page is light in any browser. On a narrow one the curves go above the legend; on a phone,
-#: upright, both go below the scene, so that the scene is wide enough for two arms.
-STYLE = """
-#legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
-display:flex;flex-wrap:wrap-reverse;justify-content:space-between;align-items:end;gap:.5em;
-font:14px sans-serif;color:#333}
-#legend>*{background:rgba(255,255,255,.9);padding:.5em;box-sizing:border-box;max-width:100%}
-#curves{width:24em;font-size:12px;overflow-wrap:anywhere}
-#curves summary{pointer-events:auto;cursor:pointer}
-#curves .row{display:flex;justify-content:space-between;gap:1em}
-#curves .row :last-child{white-space:nowrap}
-#curves svg{display:block;width:100%;height:3.5em;overflow:visible;
-border-bottom:1px solid currentColor}
-#curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
-#curves line{stroke:currentColor;stroke-width:1}
-#curves .mark{stroke-dasharray:3 3;opacity:.6}
-@media (max-aspect-ratio:3/5){#root{height:120vw!important}
-#legend{top:120vw;bottom:auto;left:0;right:0;flex-flow:column;align-items:stretch;gap:0}
-#curves{width:100%}}
-"""
-
 Dragged = Callable[[str, Any], None]
 
 
@@ -127,8 +106,9 @@ def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
         f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
         for kind, text in entries.items()
     )
+    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     return (
-        f'<style>{STYLE}</style><div id="legend">'
+        f'<style>{style}</style><div id="legend">'
         f"<div><b>{html.escape(title)}</b>{lines}</div>{curves}</div>"
     )
 

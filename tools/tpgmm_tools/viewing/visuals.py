@@ -134,10 +134,11 @@ def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[
     shapes: dict[str, list[Shape]] = {}
     for link, elements in visuals.items():
         read = (_shape(element, link, materials, meshes) for element in elements)
-        shapes[link] = [shape for shape in read if shape is not None]
-        if not shapes[link] and (elements or plain):
-            shapes[link] = _sticks(model, link)
-    return {link: solids for link, solids in shapes.items() if solids}
+        solids = [shape for shape in read if shape is not None]
+        if not solids and (elements or plain):
+            solids = _sticks(model, link)
+        shapes |= {link: solids} if solids else {}
+    return shapes
 
 
 def _shape(
