@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Alignments", "DataOptions", "RobotOptions", "SceneOptions", "align", "command",
-    "load_one_thread", "read_situations", "show_progress",
+    "load_one_thread", "read_situations", "refuse", "show_progress",
 ]  # fmt: skip
 
 #: Options that most people need: a command's ``--help`` lists those of them that it has.
@@ -156,19 +156,18 @@ class RobotOptions:
             If the options do not go together.
         """
         from tpgmm_datasets.robots import parse_robot
-        from tpgmm_torch.exceptions import DataError
         from tpgmm_torch.robots.tracked_poses import Poses
 
         parts = any((self.link, self.robot_joint, self.coordinate))
         if self.poses and (self.robot or parts):
-            raise DataError("--poses are instead of --robot and its links and joints")
+            raise refuse("--poses are instead of --robot and its links and joints")
         if self.poses:
             return Poses(self.poses)
         if self.robot:
             chosen = {"joints": self.robot_joint or None, "coordinates": self.coordinate or ()}
             return parse_robot(self.robot, self.link or (), **chosen)
         if parts:
-            raise DataError("--link, --robot-joint and --coordinate need --robot FILE")
+            raise refuse("--link, --robot-joint and --coordinate need --robot FILE")
         return None
 
 
@@ -198,14 +197,20 @@ class SceneOptions:
     def read(self, skill: Skill, shown: list[Demonstration]) -> dict[str, Any]:
         """Return shapes of objects, the folder of meshes, and obstacles, as views take them."""
         from tpgmm_tools.viewing import parse_shape
-        from tpgmm_torch.exceptions import DataError
 
         if self.meshes is not None and not self.meshes.is_dir():
-            raise DataError(f"--meshes needs a folder, got {str(self.meshes)!r}")
+            raise refuse(f"--meshes needs a folder, got {str(self.meshes)!r}")
         pairs = [text.partition("=") for text in self.object_ or ()]
         shapes = {name: parse_shape(shape) for name, _, shape in pairs}
         around = self.obstacles and read_obstacles(self.obstacles, skill, self.visuals, shown)
         return {"objects": shapes, "meshes": self.meshes, "obstacles": around}
+
+
+def refuse(message: str) -> Exception:
+    """Return the error of options that cannot be, for ``raise``."""
+    from tpgmm_torch.exceptions import DataError
+
+    return DataError(message)
 
 
 def filter_plausibility(action: str) -> None:
@@ -371,12 +376,8 @@ def align(
 
 def check_situation(number: int, count: int) -> None:
     """Refuse a ``number`` of --situation behind the last of ``count`` situations."""
-    from tpgmm_torch.exceptions import DataError
-
     if number >= count:
-        raise DataError(
-            f"there are {count} situations, counted from 0; got --situation {number}"
-        )
+        raise refuse(f"there are {count} situations, counted from 0; got --situation {number}")
 
 
 def read_obstacles(
@@ -384,10 +385,9 @@ def read_obstacles(
 ) -> Scene:
     """Put the robot among the obstacles of a ``file``; what is allowed is listed."""
     from tpgmm_control.obstacles import Scene
-    from tpgmm_torch.exceptions import DataError
 
     if not file.is_file():
-        raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
+        raise refuse(f"--obstacles is an MJCF file, got {str(file)!r}")
     scene = Scene(skill.kinematics, file, visuals=visuals).allowing(shown).allowing_skill(skill)
     for (one, other), reason in scene.allowed.items():
         typer.echo(f"allowed: {one} and {other} ({reason})")

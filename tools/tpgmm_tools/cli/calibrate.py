@@ -121,7 +121,6 @@ def cell(
     out : ``DIR``
         Where pictures with the corners that were seen and expected go.
     """
-    from tpgmm_torch.exceptions import DataError
     from tpgmm_vision.calibration.cell_calibration import calibrate_cell
     from tpgmm_vision.cell import read_cell, write_cell
 
@@ -132,12 +131,16 @@ def cell(
     links = {*filter(None, carriers), *(described.link or ())}
     robot = replace(described, link=sorted(links)).read()
     if robot is None or not cameras or not mounts:
-        raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
-                        "(tpgmm calibrate camera) and tags in its hand (--hand)")  # fmt: skip
+        raise options.refuse(
+            "a cell is calibrated by its robot (--robot FILE), with cameras in it "
+            "(tpgmm calibrate camera) and tags in its hand (--hand)"
+        )
     content, names = dict(before.content), list(robot.joint_names)
     if content.get("joints", names) != names:
-        raise DataError(f"{cell} is of a robot with joints {content['joints']}, this one has "
-                        f"{names}: give another --cell")  # fmt: skip
+        raise options.refuse(
+            f"{cell} is of a robot with joints {content['joints']}, this one has {names}: give "
+            "another --cell"
+        )
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
     looked = _Pictures(reading.open(path, robot, frames={}), cameras)
     result = calibrate_cell(
@@ -196,14 +199,13 @@ def _read_mounts(
     hand: Sequence[str] | None, check: Sequence[str] | None
 ) -> tuple[dict[str, Mount], dict[str, Any]]:
     """Return the targets of --check and --hand, and the cell file's entries of the former."""
-    from tpgmm_torch.exceptions import DataError
     from tpgmm_vision.calibration.cell_calibration import Mount
     from tpgmm_vision.targets import target_from
 
     checks, hands = (dict(map(_target, texts or ())) for texts in (check, hand))
     names = [text.partition("=")[0] for text in (*(hand or ()), *(check or ()))]
     if len({*names}) < len(names):
-        raise DataError(f"--hand and --check name each target once, got {names}")
+        raise options.refuse(f"--hand and --check name each target once, got {names}")
     mounts = {name: Mount(target_from(entry, name), None) for name, entry in checks.items()}
     for link, entry in hands.items():
         mounts[link] = Mount(target_from(entry, link), link)
@@ -241,15 +243,13 @@ def _report_result(result: CellCalibration, cameras: str, postures: int) -> Iter
 
 def _target(text: str) -> tuple[str, dict[str, Any]]:
     """Return the name of a target that an option describes, and its entry in a cell file."""
-    from tpgmm_torch.exceptions import DataError
-
     name, _, described = text.partition("=")
     try:
         kind, numbers, size = described.split(":")
         several = [int(number) for number in numbers.split(",")]
         return name, {kind: {"cube": several, "tag": several[0]}[kind], "size": float(size)}
     except (ValueError, KeyError) as error:
-        raise DataError(
+        raise options.refuse(
             f"tags are described as NAME=cube:10,11,12,13,14:0.03 or NAME=tag:3:0.04 (numbers, "
             f"and the edge in metres), got {text!r}"
         ) from error

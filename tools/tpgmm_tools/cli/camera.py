@@ -50,14 +50,13 @@ def print(
     out : ``FILE.pdf``
         Where it goes.
     """
-    from tpgmm_torch.exceptions import DataError
     from tpgmm_vision.printing import print_targets
     from tpgmm_vision.targets import Board
 
     try:
         cubes = [[int(number) for number in one.split(",")] for one in cube or ()]
     except ValueError as error:
-        raise DataError(f"--cube has numbers, as 10,11,12,13,14, got {cube}") from error
+        raise options.refuse(f"--cube has numbers, as 10,11,12,13,14, got {cube}") from error
     style, drawn = {"family": family, "page": page}, Board() if board else None
     entries = print_targets(out, tag or (), cubes, drawn, size=size / 1e3, **style)
     typer.echo(f"{out}: print it at 100 %, and measure the ruler")

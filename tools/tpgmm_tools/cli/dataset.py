@@ -325,11 +325,9 @@ def track(
 
 def _tasks(episodes: Sequence[Episode]) -> list[str]:
     """Return the task of each episode, which must have one."""
-    from tpgmm_torch.exceptions import DataError
-
     for episode in episodes:
         if len(episode.tasks) != 1:
-            raise DataError(
+            raise options.refuse(
                 f"episode {episode.index} has {len(episode.tasks)} tasks, not one: give --task"
             )
     return [episode.tasks[0] for episode in episodes]

@@ -78,14 +78,14 @@ def reproduce(
         With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
     from tpgmm_control.loop.rollout import rollout
-    from tpgmm_torch.exceptions import DataError, UnknownNameError
+    from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.persistence import load_skill
     from tpgmm_torch.skills.via_points import ViaPoints
 
     if out.suffix not in FORMATS:
-        raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
+        raise options.refuse(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
-        raise DataError("give either --situations FILE.json or --dataset DATASET")
+        raise options.refuse("give either --situations FILE.json or --dataset DATASET")
     skill = load_skill(model, device="cpu")
     kinematics = skill.kinematics
     wanted, shown = options.read_situations(situations, dataset, data, kinematics)
@@ -96,7 +96,7 @@ def reproduce(
     except UnknownNameError as error:
         if error.kind != "frame" or dataset is None:
             raise
-        raise DataError(
+        raise options.refuse(
             f"{error}. Say where it is in the data set, as to 'tpgmm fit': --frame "
             f"{error.name}=FEATURE or --frame {error.name}=LINK@EVENT"
         ) from error

@@ -96,11 +96,11 @@ def view(
 
 def _check(place: Path, suffix: str, live: bool, shown: bool) -> None:
     """Refuse a file of another kind, what does not go together, and nothing to show."""
-    from tpgmm_torch.exceptions import DataError
-
     if place.suffix != suffix:
-        raise DataError(f"--out ends in {suffix}, got {str(place)!r}")
+        raise options.refuse(f"--out ends in {suffix}, got {str(place)!r}")
     if suffix == SUFFIXES["rerun"] and live:
-        raise DataError("--live serves a page, --format rerun writes a file: give one of them")
+        raise options.refuse(
+            "--live serves a page, --format rerun writes a file: give one of them"
+        )
     if not shown:
-        raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
+        raise options.refuse("give --dataset DATASET or --situations FILE.json: what to show")

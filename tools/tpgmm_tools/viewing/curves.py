@@ -86,7 +86,7 @@ class Mark:
 
 
 def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Mark]:
-    """Events of the demonstrations within a motion, by time.
+    """Return events of the demonstrations within a motion, by time.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
 
 
 def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Panel]:
-    """Stiffness and the operators' shares, over time.
+    """Compute stiffness and the operators' shares, over time.
 
     Parameters
     ----------
@@ -137,25 +137,17 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
     if model.holds_:
         skill = as_array(trajectory.time)
+        holds = [(hold.begin <= skill) & (skill <= hold.end) for hold in model.holds_]
         held = [
-            Curve(
-                f"{hold.frame} by {hold.link}",
-                color,
-                ((hold.begin <= skill) & (skill <= hold.end)).astype(float),
-            )
-            for hold, color in zip(model.holds_, cycle(OPERATORS), strict=False)
+            Curve(f"{hold.frame} by {hold.link}", color, one.astype(float))
+            for hold, one, color in zip(model.holds_, holds, cycle(OPERATORS), strict=False)
         ]
         panels.append(Panel("held", time, held, 1.0))
     return panels
 
 
 def turning_joints(kinematics: Kinematics) -> list[int]:
-    """Indices of joints in rad, as tracked quaternions and lengths are not.
-
-    Parameters
-    ----------
-    kinematics : Kinematics
-    """
+    """Return indices of joints of some ``kinematics`` in rad: no quaternions, no lengths."""
     others = {*kinematics.lengths}
     for start in kinematics.quaternion_starts:
         others.update(range(start, start + 4))
@@ -163,7 +155,7 @@ def turning_joints(kinematics: Kinematics) -> list[int]:
 
 
 def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
-    """The panels as a part of a page, to be folded away; a marker follows the time line.
+    """Write panels as a part of a page, to be folded away; a marker follows the time line.
 
     Drawings have seconds and the curves' own units for coordinates, upwards.
 

@@ -33,7 +33,7 @@ __all__ = ["LiveView", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
-Dragged = Callable[[str, Any], None]
+OnDrag = Callable[[str, Any], None]
 
 
 def write_motion(
@@ -95,7 +95,7 @@ def write_motion(
 
 
 def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
-    """The colours' meaning, and the curves, along the lower edge."""
+    """Write the colours' meaning, and the curves, along the lower edge."""
     entries = {
         "reproduction": "reproduction",
         "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
@@ -115,7 +115,7 @@ def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
 
 @contextmanager
 def viser_server(host: str, port: int) -> Iterator[Any]:
-    """A viser server on ``host`` and ``port`` (0 for any that is free) that stops in the end.
+    """Serve by viser on ``host`` and ``port`` (0 for any that is free), and stop in the end.
 
     Raises
     ------
@@ -141,9 +141,9 @@ def draw(
     scene: Any,
     drawing: Drawing,
     handles: Mapping[str, Any] | None = None,
-    dragged: Dragged | None = None,
+    on_drag: OnDrag | None = None,
 ) -> dict[str, Any]:
-    """Draw into a viser scene; its nodes by their path.
+    """Draw into a viser scene, and return its nodes by their path.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def draw(
         The motion.
     handles : mapping of str to viser.SceneNodeHandle, optional
         Nodes that are there already, of another motion of the same model.
-    dragged : callable, optional
+    on_drag : callable, optional
         Makes objects movable by hand: called with the name of one, and viser's event.
     """
     nodes = dict(handles or {})
@@ -161,7 +161,7 @@ def draw(
         nodes.pop(gone).remove()
     for path, node in drawing.nodes.items():
         if path not in nodes:
-            nodes[path] = _add_node(scene, path, node, drawing.size, dragged)
+            nodes[path] = _add_node(scene, path, node, drawing.size, on_drag)
     for path, lines in drawing.lines.items():
         scene.add_line_segments(
             path, points=lines.points, colors=lines.color, thickness=lines.thickness,
@@ -204,12 +204,12 @@ def place(handle: Any, pose: Array) -> None:
     handle.position, handle.wxyz = pose[:3], pose[3:]
 
 
-def _add_node(scene: Any, path: str, node: Node, size: float, dragged: Dragged | None) -> Any:
+def _add_node(scene: Any, path: str, node: Node, size: float, on_drag: OnDrag | None) -> Any:
     axes = {"axes_length": node.axes, "axes_radius": 0.03 * node.axes, "origin_radius": 0.0}
-    if dragged is not None and path.startswith("/frames/"):
+    if on_drag is not None and path.startswith("/frames/"):
         handle = scene.add_transform_controls(path, scale=0.12 * size, disable_sliders=True)
         scene.add_frame(f"{path}/axes", **axes)
-        handle.on_update(partial(dragged, node.label))
+        handle.on_update(partial(on_drag, node.label))
     else:
         handle = scene.add_frame(path, node.axes > 0, **axes)
     if node.label:
@@ -237,7 +237,7 @@ def _add_solid(scene: Any, path: str, shape: Shape) -> None:
 
 
 def _set_view(server: Any, drawing: Drawing) -> None:
-    """Camera, lights and floor."""
+    """Set camera, lights and floor."""
     size, camera = drawing.size, server.initial_camera
     camera.look_at = drawing.middle
     camera.position = camera.look_at + drawing.distance * np.array([0.8, 0.5, 0.35])
@@ -325,7 +325,7 @@ class LiveView:
             self._resources = stack.pop_all()
 
     def __enter__(self) -> Self:
-        """The view, which runs since it was made."""
+        """Return the view, which runs since it was made."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -393,7 +393,7 @@ class LiveView:
             self._move_to(self.clock)
 
     def _frames_now(self) -> dict[str, Frame]:
-        """Poses of the model's objects at the instant that is shown."""
+        """Return poses of the model's objects at the instant that is shown."""
         instants = self.drawing.trajectory.time
         at = min(int((instants - instants[0] < self.clock).sum()), len(instants) - 1)
         frames = self.situation.frames_at(instants)
