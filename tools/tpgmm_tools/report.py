@@ -340,15 +340,10 @@ def _obstacles(
 
 
 def _demonstrations(left_out: Sequence[LeftOut]) -> str:
-    rows = [
-        [
-            one.index,
-            f"{one.novelty:.2f}",
-            f"{one.path:.3f}",
-            max((round(mm, 1) for mm, _ in one.errors.values()), default="-"),
-        ]
-        for one in left_out
-    ]
+    rows = []
+    for one in left_out:
+        worst = max((round(mm, 1) for mm, _ in one.errors.values()), default="-")
+        rows.append([one.index, f"{one.novelty:.2f}", f"{one.path:.3f}", worst])
     text = (
         "<p>Novelty is how far an episode's situation is from the others, in units of the "
         f"furthest of these; above {UNLIKELY} it is unlike them.</p>"

@@ -1,11 +1,7 @@
 """The page: what its buttons answer, and the whole of it, served."""
 
 import html
-import os
 import re
-import signal
-import subprocess
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +11,7 @@ import pytest
 import torch
 
 from tests.support import browser, skills
-from tests.support.command_line import UPPER_BODY, refusal
+from tests.support.command_line import UPPER_BODY, refusal, serve
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import save_lerobot
@@ -40,7 +36,7 @@ def table(tmp_path_factory, bottles):
     return str(path)
 
 
-def learned(shown, n_components=4):
+def learn(shown, n_components=4):
     given = {"mine": lambda: (shown, upper_body())}
     return page.learn("mine", None, "none", None, "", "", n_components, given)
 
@@ -96,9 +92,9 @@ def test_without_links_or_a_skill_there_is_nothing_to_show(table):
 
 def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwarn):
     degrees = [replace(d, joints=d.joints.rad2deg()) for d in bottles]
-    skill, report = learned(degrees)
+    skill, report = learn(degrees)
     assert skill is None and "degrees" in report
-    _, report = learned([*bottles, bottles[0]])
+    _, report = learn([*bottles, bottles[0]])
     assert "**To be looked at:**\n- " in report and "copy of" in report
     assert not len(recwarn)
     with pytest.raises(ZeroDivisionError):  # no error that a user can mend
@@ -127,25 +123,10 @@ def served(tmp_path_factory, bottles):
     """The page's address; in a process of its own, as gradio leaves its event loop open."""
     folder = tmp_path_factory.mktemp("served") / "mine"
     save_lerobot(bottles, folder, fps=20, task="shake")
-    command = [sys.executable, "-c", "from tpgmm_tools.cli import main; main()", "app"]
     temporary = tmp_path_factory.mktemp("temporary")
-    with subprocess.Popen(
-        [*command, str(folder), *UPPER_BODY, "--port", "0"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"TMPDIR": str(temporary)},
-        # what a shell starts in the background would else ignore Ctrl-C
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        try:
-            line = process.stdout.readline()
-            yield re.fullmatch(r"open (http://127\.0\.0\.1:\d+/) in a browser.*\n", line)[1]
-            process.send_signal(signal.SIGINT)
-            assert process.wait(60) == 0
-            left = [path for path in temporary.rglob("*") if path.is_file()]
-            assert not left, "the page cleans up"
-        finally:
-            process.kill()
+    with serve("app", folder, *UPPER_BODY, "--port", 0, TMPDIR=str(temporary)) as url:
+        yield url
+    assert not [path for path in temporary.rglob("*") if path.is_file()], "the page cleans up"
 
 
 def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(served):

@@ -51,18 +51,12 @@ def test_a_frame_that_the_data_set_does_not_tell_is_asked_for(dataset, fitted, t
 def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
     file, out = tmp_path / "situations.json", tmp_path / "r.csv"
     situations = BottleShaking().situations(2)
-    items = [
-        {
-            "joints": s.joints.tolist(),
-            "frames": {
-                "bottle": {
-                    "position": s.frames["bottle"].position.tolist(),
-                    "orientation": s.frames["bottle"].orientation.tolist(),
-                }
-            },
+    items = []
+    for one in situations:
+        parts = {
+            k: getattr(one.frames["bottle"], k).tolist() for k in ("position", "orientation")
         }
-        for s in situations
-    ]
+        items.append({"joints": one.joints.tolist(), "frames": {"bottle": parts}})
     file.write_text(json.dumps(items))
     output("reproduce", fitted[0], "--situations", file, "--out", out)
     skill = load_model(fitted[0]).skill

@@ -2,7 +2,6 @@
 
 import copy
 import re
-import sys
 from collections import defaultdict
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from tests.support.worlds import upper_body
 from tpgmm_tools.viewing import parse_shape, write_rerun
 from tpgmm_tools.viewing.curves import motion_marks, motion_panels
 from tpgmm_torch import Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DependencyError
 
 
 class Marked(TaskParameterizedGMM):
@@ -77,23 +75,13 @@ def test_events_are_logged_when_they_are(recorded):
     assert expected == logged
 
 
-def test_paths_objects_and_uncertainty_are_there(recorded):
-    found, _ = recorded
+def test_paths_objects_uncertainty_and_curves_are_those_of_the_page(recorded):
+    found, trajectory = recorded
     assert len(found["/reproduction/l_hand"]["static LineStrips3D:strips"][0]) >= 200
     assert found["/frames/bottle/shape"]["static Cylinders3D:lengths"] == [[pytest.approx(0.2)]]
     assert found["/covariance/r_hand"]["static Ellipsoids3D:half_sizes"]
     assert found["/demonstrations/l_hand"]
-
-
-def test_the_curves_are_those_of_the_page(recorded):
-    found, trajectory = recorded
     *_, shares = motion_panels(skills.small_bottle(), trajectory)
     [entity] = [name for name in found if re.fullmatch("/curves/.*/joints", name)]
     values = [value for _, [value] in found[entity]["Scalars:scalars"]]
     np.testing.assert_allclose(values, shares.curves[-1].values, rtol=1e-6)
-
-
-def test_without_rerun_the_error_names_the_extra(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[rerun\]"):
-        write_rerun(tmp_path / "m.rrd", skills.hands(), skills.new_handling()[0])

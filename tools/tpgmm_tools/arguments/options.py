@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
@@ -217,16 +217,11 @@ def filter_plausibility(action: str) -> None:
     """Show, make an error of, or ignore what is unlikely about recordings."""
     from tpgmm_torch.exceptions import PlausibilityWarning
 
-    actions: dict[str, Literal["always", "error", "ignore"]] = {
-        "warn": "always",
-        "error": "error",
-        "ignore": "ignore",
-    }
-    warnings.simplefilter(actions[action], PlausibilityWarning)
+    warnings.filterwarnings("always" if action == "warn" else action, "", PlausibilityWarning)  # type: ignore[arg-type]
 
 
 def command(
-    app: typer.Typer, example: str, *, basic: Collection[str] = BASIC
+    app: typer.Typer, example: str
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator that adds a function to an app as a command.
 
@@ -240,8 +235,6 @@ def command(
         Where it is added.
     example : str
         Shown below the help, after "Example: ".
-    basic : collection of str
-        Parameters that ``--help`` lists, beside those that are required.
     """
 
     def add(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -263,7 +256,7 @@ def command(
 
         text = (getdoc(function) or "").partition("Parameters\n---")[0]
         run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
-        about = Help(run.__doc__, example, parameters, basic)
+        about = Help(run.__doc__, example, parameters, BASIC)
         parameters = [*parameters, HELP_ALL]
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}

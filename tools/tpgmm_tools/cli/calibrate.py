@@ -67,9 +67,8 @@ def camera(
     entry = camera_content(result.camera, key) | ({"link": link} if link else {})
     content.setdefault("cameras", {})[name] = entry | {"report": str(result)}
     write_cell(content, cell)
-    typer.echo(
-        "\n".join([f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)])
-    )
+    for line in (f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)):
+        typer.echo(line)
     typer.echo(f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ...")
 
 

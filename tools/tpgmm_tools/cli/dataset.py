@@ -130,7 +130,7 @@ def plot(
     out : ``FILE.png``
         Where the picture goes.
     """
-    import numpy as np
+    import torch
 
     from tpgmm_tools.plotting import figure, save
 
@@ -139,15 +139,11 @@ def plot(
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
     panels += [f"{name}.{axis}" for name in first.frames for axis in "xyz"]
     drawing = figure(len(panels), f"{path}: {len(demonstrations)} episodes", height=0.9)
-    for demonstration in demonstrations:
-        time = demonstration.time.numpy()
-        poses = [
-            np.broadcast_to(pose.position.numpy(), (len(time), 3))
-            for pose in demonstration.frames.values()
-        ]
-        values = np.concatenate([demonstration.joints.numpy(), *poses], axis=1)
+    for one in demonstrations:
+        frames = [frame.expand(one.time.shape).position for frame in one.frames.values()]
+        values = torch.cat([one.joints, *frames], dim=1)
         for axes, column in zip(drawing.axes, values.T, strict=True):
-            axes.plot(time, column, linewidth=0.8, alpha=0.7)
+            axes.plot(one.time, column, linewidth=0.8, alpha=0.7)
     for axes, name in zip(drawing.axes, panels, strict=True):
         axes.set_ylabel(name, fontsize="x-small", rotation=0, ha="right")
         axes.tick_params(labelsize="x-small")
@@ -188,8 +184,8 @@ def generate(
     if path.exists() and not append:  # the writer would say so too, ten seconds later
         raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
     skill = BottleShaking(rate=rate, steady_rhythm=steady_rhythm)
-    demonstrations = skill.demonstrations(n_demonstrations, random_state)
-    _save(demonstrations, path, append, fps=rate, task=TASK, robot_type="upper_body")
+    shown = skill.demonstrations(n_demonstrations, random_state)
+    _save(shown, path, append, fps=rate, task=TASK, robot_type="upper_body")
 
 
 @options.command(app, CONVERT)
@@ -224,19 +220,14 @@ def convert(
     layout, columns = recording.assembly.layout, recording.assembly.joints
     kept = demonstrations[0].joint_names or ()
     stored = {"m": "m", "mm": "m", "raw": "raw"}  # what is no angle once it is read
-    _save(
-        demonstrations,
-        path,
-        append,
-        fps=data.rate or layout.fps,
-        task=[task] * len(demonstrations) if task else _tasks(recording.episodes),
-        robot_type=layout.robot_type,
-        units={
-            name: stored[unit]
-            for name, unit in zip(columns.names or (), columns.units, strict=False)
-            if name in kept and unit in stored
-        },
-    )
+    units = {
+        name: stored[unit]
+        for name, unit in zip(columns.names or (), columns.units, strict=False)
+        if name in kept and unit in stored
+    }
+    tasks = [task] * len(demonstrations) if task else _tasks(recording.episodes)
+    about = {"task": tasks, "robot_type": layout.robot_type, "units": units}
+    _save(demonstrations, path, append, fps=data.rate or layout.fps, **about)
 
 
 @options.command(
