@@ -107,6 +107,12 @@ def test_debug_and_what_no_user_can_mend_keep_the_traceback(monkeypatch):
     assert isinstance(run("dataset", "check", "x").exception, ZeroDivisionError)
 
 
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gradio", None)
+    said = "this command needs gradio: pip install 'tpgmm-torch[app]'"
+    assert refusal("app") == f"tpgmm: {said}"
+
+
 def test_warnings_and_missing_packages_are_one_line_each(monkeypatch):
     def warn(path):
         warnings.warn("it did not\nconverge", UserWarning, stacklevel=1)

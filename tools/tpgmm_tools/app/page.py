@@ -26,7 +26,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import save
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -263,18 +263,9 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
     -------
     gradio.Blocks
         ``launch()`` serves it.
-
-    Raises
-    ------
-    DependencyError
-        If gradio is not installed.
     """
-    try:
-        import gradio as gr
-    except ImportError as error:
-        raise DependencyError(
-            "the page needs gradio: pip install 'tpgmm-torch[app]'"
-        ) from error
+    import gradio as gr
+
     sources = [*(more or {}), GENERATED, UPLOADED]
     with gr.Blocks(
         title="tpgmm: a skill from demonstrations",

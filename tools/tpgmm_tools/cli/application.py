@@ -41,7 +41,9 @@ HELP = {
 #: How scikit-learn names a parameter; on the command line it is an option.
 PARAMETER = re.compile(r"the '(\w+)' parameter of TaskParameterizedGMM")
 #: Extras by the packages that come with them.
-OPTIONAL = {"matplotlib": "cli", "pandas": "cli", "pyarrow": "cli", "av": "vision"}
+OPTIONAL = {
+    "av": "vision", "gradio": "app", "matplotlib": "cli", "pandas": "cli", "pyarrow": "cli",
+}  # fmt: skip
 
 
 class Commands(TyperGroup):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.mixture.processes import Processes
+    from tpgmm_torch.operators import Operator
     from tpgmm_torch.robots.kinematics import Kinematics
     from tpgmm_torch.structure.choices import Choices
 
@@ -177,9 +177,9 @@ def fit(
     robust : bool
         Leave out episodes that are unlike the others where these agree, with a warning.
     """
+    from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.signals import Signals
     from tpgmm_torch.mixture.processes import joined_processes
-    from tpgmm_torch.operators.text import parse_operator
     from tpgmm_torch.persistence import save
     from tpgmm_torch.structure import choices as structure
 
@@ -188,35 +188,45 @@ def fit(
     choices.check(batch_episodes)
     options.filter_plausibility(plausibility)
     robot, holds = described.read(), _parse_holds(hold)
-    operators = [parse_operator(text) for text in operator or () if text != "auto"]
+    operators = _parse_operators(operator)
     model = settings.model(operators, robot)
     recording = data.open(dataset, robot)
     model.robot = robot = recording.assembly.robot
     about = data.arguments(robot)
+    size = batch_episodes
+    batched = None if size is None else partial(EpisodeBatches, dataset, size, **about)
     with joined_processes() as processes:
-        source = _Source(recording, dataset, about, batch_episodes, processes)
-        first = source.align(alignment, robot)
-        model.operators = structure.operators_or_default(
-            operators, robot, list(first[0].frames)
-        )
+        read = list(recording.demonstrations()) if batched is None else []
+        first, fitted = _align(read, batched, alignment, robot)
+        frames = list(first[0].frames)
+        model.operators = structure.operators_or_default(operators, robot, frames)
         kept = structure.prepared(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
-            _echo(_sum_up_episodes(recording, source.read, kept))
+            _echo(_sum_up_episodes(recording, read, kept))
             _echo(_sum_up_recording(recording, kept, described.link, not operator))
-        learned, reports = structure.learn(model, source.share(kept), choices, processes)
+        episodes: Any = processes.share(kept)
+        if batched is not None:
+            batches = batched(processes=processes)
+            episodes = _Aligned(batches, fitted, kept[0].holds or ())
+        learned, reports = structure.learn(model, episodes, choices, processes)
         if processes.rank > 0:
             return
     if write is None:
         save(learned, out)
     else:
         write(learned, out, Signals.of(dataset, **about))
-    _report(learned, source.read, kept)
-    for text in reports:
-        typer.echo(f"\n{text}\n")
+    _report(learned, read, kept, reports)
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
     typer.echo(f"next             tpgmm report {out} --dataset {dataset}")
+
+
+def _parse_operators(texts: list[str] | None) -> list[Operator]:
+    """Parse the option --operator; empty if they are to be found, or the default."""
+    from tpgmm_torch.operators.text import parse_operator
+
+    return [parse_operator(text) for text in texts or () if text != "auto"]
 
 
 def _parse_holds(texts: list[str] | None) -> tuple[Hold, ...] | None:
@@ -228,60 +238,37 @@ def _parse_holds(texts: list[str] | None) -> tuple[Hold, ...] | None:
     return () if texts == ["none"] else tuple(map(Hold.parse, texts))
 
 
-class _Source:
-    """Episodes of a recording, all at once or in batches, aligned.
+class _Aligned:
+    """Batches of episodes, aligned as they are read.
 
     Parameters
     ----------
-    recording, dataset, about : Recording, str, dict
-        What is read, where it is, and the arguments with which batches of it are.
-    batch : int or None
-        Episodes at a time; None for all.
-    processes : Processes
-        Among which they are shared.
+    batches, alignment, holds : EpisodeBatches, Alignment or None, tuple of Hold
+        What is read; and how, as the first of all batches decided.
     """
 
-    def __init__(
-        self, recording: Recording, dataset: str, about: dict[str, Any], batch: int | None,
-        processes: Processes,
-    ) -> None:  # fmt: skip
-        from tpgmm_datasets.episode_batches import EpisodeBatches
-
-        self.batched = partial(EpisodeBatches, dataset, batch, **about) if batch else None
-        self.batches: Iterable[list[Demonstration]] = ()
-        self.read = [] if batch else list(recording.demonstrations())
-        self.processes = processes
-        self.alignment: Any = None
-        self.holds: tuple[Hold, ...] = ()
-
-    def align(self, method: str, robot: Kinematics | None) -> list[Demonstration]:
-        """Align all that was read, or the first batch, which decides for the others."""
-        from tpgmm_torch.structure.choices import aligner
-
-        if self.batched is None:
-            return options.align(self.read, method, robot)
-        first, alignment = next(iter(self.batched())), aligner(method, robot)
-        self.alignment = alignment and alignment.fit(first)
-        return self._transform(first)
-
-    def share(self, kept: list[Demonstration]) -> Any:
-        """Return the share of this process: of what is ``kept``, or of all batches."""
-        shared = self.processes.share(kept)
-        if self.batched is None:
-            return shared
-        self.holds = kept[0].holds or ()
-        self.batches = self.batched(processes=self.processes)
-        return self
+    def __init__(self, batches: Any, alignment: Any, holds: tuple[Hold, ...]) -> None:
+        self.batches, self.alignment, self.holds = batches, alignment, holds
 
     def __iter__(self) -> Iterator[list[Demonstration]]:
         """Read and align each batch."""
         from tpgmm_torch.training.hold_detection import with_holds
 
         for batch in self.batches:
-            yield with_holds(self._transform(batch), self.holds)
+            aligned = self.alignment.transform(batch) if self.alignment else batch
+            yield with_holds(aligned, self.holds)
 
-    def _transform(self, batch: list[Demonstration]) -> list[Demonstration]:
-        return self.alignment.transform(batch) if self.alignment else batch
+
+def _align(
+    read: list[Demonstration], batched: Any, method: str, robot: Kinematics | None
+) -> tuple[list[Demonstration], Any]:
+    """Align all that was read, or else the first batch; and return what aligns the others."""
+    from tpgmm_torch.structure.choices import aligner
+
+    if batched is None:
+        return options.align(read, method, robot), None
+    first, alignment = next(iter(batched())), aligner(method, robot)
+    return alignment.fit(first).transform(first) if alignment else first, alignment
 
 
 def _sum_up_episodes(recording: Recording, read: Any, kept: Any) -> dict[str, str]:
@@ -356,7 +343,7 @@ def _echo(lines: dict[str, str]) -> None:
         typer.echo(f"{name:<16} {text}")
 
 
-def _report(learned: Any, read: Any, aligned: Any) -> None:
+def _report(learned: Any, read: Any, aligned: Any, reports: list[str]) -> None:
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.operators.text import format_operator
 
@@ -370,6 +357,8 @@ def _report(learned: Any, read: Any, aligned: Any) -> None:
     if isinstance(learned, TaskParameterizedGMM):
         lines |= _sum_up_model(learned, read, aligned)
     _echo(lines)
+    for text in reports:
+        typer.echo(f"\n{text}\n")
 
 
 def _sum_up_model(model: TaskParameterizedGMM, read: Any, aligned: Any) -> dict[str, str]:

@@ -134,10 +134,10 @@ def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[
     shapes: dict[str, list[Shape]] = {}
     for link, elements in visuals.items():
         read = (_shape(element, link, materials, meshes) for element in elements)
-        solids = [shape for shape in read if shape is not None]
-        if not solids and (elements or plain):
-            solids = _sticks(model, link)
-        shapes |= {link: solids} if solids else {}
+        if solids := [shape for shape in read if shape is not None]:
+            shapes[link] = solids
+        elif elements or plain:
+            shapes[link] = _sticks(model, link)
     return shapes
 
 
