@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support import browser, skills
+from tests.support import browser
 from tests.support.command_line import UPPER_BODY, refusal, serve
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
@@ -22,11 +22,6 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.persistence import load_model
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def bottles():
-    return skills.generator().demonstrations(2)
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +114,8 @@ def test_objects_are_turned_about_the_vertical_through_them():
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory, bottles):
-    """The page's address; in a process of its own, as gradio leaves its event loop open."""
+def url(tmp_path_factory, bottles):
+    """Serve the page, in a process of its own, as gradio leaves its event loop open."""
     folder = tmp_path_factory.mktemp("served") / "mine"
     save_lerobot(bottles, folder, fps=20, task="shake")
     temporary = tmp_path_factory.mktemp("temporary")
@@ -129,10 +124,10 @@ def served(tmp_path_factory, bottles):
     assert not [path for path in temporary.rglob("*") if path.is_file()], "the page cleans up"
 
 
-def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(served):
+def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(url):
     assert "describes DATASET" in refusal("app", *UPPER_BODY)
     with browser.page(1200, 1000) as shown:
-        shown.open(served)
+        shown.open(url)
         button = "[...document.querySelectorAll('button')].find(b => b.innerText == '{}')"
         learn, show = button.format("Learn"), button.format("Show")
         shown.wait_for(f"!!{learn}")
@@ -144,5 +139,5 @@ def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(serv
         shown.evaluate("document.querySelector('iframe').scrollIntoView({block: 'center'})")
         browser.draws(shown)
         assert shown.complaints == []
-        local = (served, "data:", "blob:")
+        local = (url, "data:", "blob:")
         assert [one for one in shown.requests if not one.startswith(local)] == []

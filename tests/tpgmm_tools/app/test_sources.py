@@ -6,7 +6,6 @@ import zipfile
 import numpy as np
 import pytest
 
-from tests.support import skills
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.tables import demonstrations_to_frame, write_table
@@ -15,13 +14,8 @@ from tpgmm_torch.exceptions import DataError
 
 
 @pytest.fixture(scope="module")
-def bottles():
-    return skills.generator().demonstrations(2)
-
-
-@pytest.fixture(scope="module")
 def archive(tmp_path_factory, bottles):
-    """A data set as somebody would zip its folder."""
+    """Write a data set as somebody would zip its folder."""
     place = tmp_path_factory.mktemp("sets")
     save_lerobot(bottles, place / "above" / "dataset", fps=20, task="shake")
     return shutil.make_archive(str(place / "mine"), "zip", place / "above")

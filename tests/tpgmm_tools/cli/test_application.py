@@ -31,7 +31,7 @@ def test_version_and_help_need_no_command():
 
 
 def leaves(command, path=()):
-    """The names that lead to each command that does something."""
+    """Find the names that lead to each command that does something."""
     context = typer.Context(command)
     for name in getattr(command, "list_commands", lambda _: ())(context):
         _, inner, _ = command.resolve_command(context, [name])

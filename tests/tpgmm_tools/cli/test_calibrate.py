@@ -21,7 +21,7 @@ CUBE = "cube:10,11,12,13,14:0.03"
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def waving(tmp_path_factory):
     rng = np.random.default_rng(5)
     cell = so101_cell(1.0, rng, pixels=0.0)
     root = tmp_path_factory.mktemp("waving") / "set"
@@ -37,8 +37,8 @@ def written(tmp_path):
     return path
 
 
-def test_a_cell_is_calibrated_by_a_recorded_set(recorded, written, tmp_path):
-    cell, path = recorded
+def test_a_cell_is_calibrated_by_a_recorded_set(waving, written, tmp_path):
+    cell, path = waving
     out = tmp_path / "pictures"
     arguments = ["--robot", "so101", "--units", "deg", "--hand", f"{HAND}={CUBE}"]
     text = output("calibrate", "cell", path, "--cell", written, *arguments, "--out", out)
@@ -59,8 +59,8 @@ def test_a_cell_is_calibrated_by_a_recorded_set(recorded, written, tmp_path):
     assert orange > 100 and green > 100
 
 
-def test_what_the_options_get_wrong_is_said_and_nothing_is_written(recorded, written, tmp_path):
-    _, path = recorded
+def test_what_the_options_get_wrong_is_said_and_nothing_is_written(waving, written, tmp_path):
+    _, path = waving
     before = written.read_text()
     place = "--cell", written, "--out", tmp_path / "none"
     arguments = "calibrate", "cell", path, *place, "--robot", "so101"

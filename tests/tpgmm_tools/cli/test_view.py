@@ -16,7 +16,7 @@ from tpgmm_torch.persistence import save
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """A folder as ``tpgmm demo`` writes it."""
+    """Make a folder as ``tpgmm demo`` writes it."""
     folder = tmp_path_factory.mktemp("demo")
     save(skills.small_bottle(), folder / "model")
     demonstrations = skills.generator().demonstrations(2)

@@ -29,7 +29,7 @@ def reproduce(model, situation):
 
 @pytest.fixture(scope="module")
 def motion(tmp_path_factory):
-    """A page, the reproduction in it, and the situation."""
+    """Write a page; return it, the reproduction in it, and the situation."""
     path = tmp_path_factory.mktemp("view") / "new" / "motion.html"
     shown = skills.few_bottles()
     situation = Situation.of(shown[1])

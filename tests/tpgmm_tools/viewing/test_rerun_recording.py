@@ -31,7 +31,7 @@ def with_an_event():
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def chunks(tmp_path_factory):
     """Columns by entity, (instants, values) where there is a time line; and the trajectory."""
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
@@ -53,8 +53,8 @@ def recorded(tmp_path_factory):
     return found, trajectory
 
 
-def test_links_are_where_the_joints_put_them(recorded):
-    found, trajectory = recorded
+def test_links_are_where_the_joints_put_them(chunks):
+    found, trajectory = chunks
     moved = found["/robot/l_hand"]
     hand = upper_body().state(trajectory.joints).position("l_hand")
     instants = (trajectory.time - trajectory.time[0]).numpy()
@@ -64,8 +64,8 @@ def test_links_are_where_the_joints_put_them(recorded):
         np.testing.assert_allclose(position, hand[step], atol=2e-5)
 
 
-def test_events_are_logged_when_they_are(recorded):
-    found, trajectory = recorded
+def test_events_are_logged_when_they_are(chunks):
+    found, trajectory = chunks
     expected = [(m.time, m.label) for m in motion_marks(with_an_event(), trajectory)]
     logged = [
         (pytest.approx(now.total_seconds(), abs=1e-6), text)
@@ -75,8 +75,8 @@ def test_events_are_logged_when_they_are(recorded):
     assert expected == logged
 
 
-def test_paths_objects_uncertainty_and_curves_are_those_of_the_page(recorded):
-    found, trajectory = recorded
+def test_paths_objects_uncertainty_and_curves_are_those_of_the_page(chunks):
+    found, trajectory = chunks
     assert len(found["/reproduction/l_hand"]["static LineStrips3D:strips"][0]) >= 200
     assert found["/frames/bottle/shape"]["static Cylinders3D:lengths"] == [[pytest.approx(0.2)]]
     assert found["/covariance/r_hand"]["static Ellipsoids3D:half_sizes"]

@@ -20,7 +20,7 @@ from tpgmm_torch.robots.urdf import read_urdf
 
 @pytest.fixture(scope="module")
 def bottle():
-    """The paper's skill at two pictures per second, and the demonstrations in it."""
+    """Draw the paper's skill at two pictures per second, and the demonstrations in it."""
     shown = skills.few_bottles()
     scene = MotionScene(skills.small_bottle(), shown, fps=2.0)
     return scene.draw(Situation.of(shown[1])), shown
