@@ -10,7 +10,6 @@ from pathlib import Path
 import typer
 
 from tpgmm_tools.arguments import options
-from tpgmm_torch.exceptions import DataError
 
 __all__ = ["app"]
 
@@ -163,4 +162,4 @@ def _numbers(text: str, option: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
-        raise DataError(f"{option} takes numbers like 5,10,25, got {text!r}") from None
+        raise options.refuse(f"{option} takes numbers like 5,10,25, got {text!r}") from None

@@ -18,14 +18,14 @@ def contacts(
     situations: Iterable[Situation],
     holds: Sequence[Hold],
 ) -> Iterator[tuple[int, Contact]]:
-    """Contacts in motions, each in its situation, with the number of the motion.
+    """Find contacts in motions, each in its situation, with the number of the motion.
 
     Parameters
     ----------
     scene : Scene
-    motions : iterable of Trajectory
-    situations : iterable of Situation
-        As many.
+        With the obstacles.
+    motions, situations : iterable of Trajectory, iterable of Situation
+        As many of each.
     holds : sequence of Hold
         What the robot holds meanwhile.
     """

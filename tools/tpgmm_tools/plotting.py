@@ -63,7 +63,7 @@ STYLE: dict[str, Any] = {
 
 
 def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Figure:
-    """A new matplotlib figure of panels one above the other with a common time axis.
+    """Make a matplotlib figure of panels one above the other with a common time axis.
 
     It belongs to no window, so it works without a display and needs no closing.
 
@@ -104,7 +104,7 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
 
 
 def operator_labels(operators: Sequence[Operator]) -> list[str]:
-    """Short names of operators for a legend: links, and the frames that they are seen from.
+    """Shorten operators for a legend: links, and the frames that they are seen from.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def _label(operator: Operator) -> str:
 
 
 def legend(drawing: Figure) -> None:
-    """One legend below all panels, where it hides nothing: each label once.
+    """Add one legend below all panels, where it hides nothing: each label once.
 
     Parameters
     ----------
@@ -211,28 +211,31 @@ def plot_joints(
         If there is no such joint, or no matplotlib.
     """
     names = list(motion.joint_names or (f"joint_{i}" for i in range(motion.joints.shape[1])))
-    for name in joints or ():
-        if name not in names:
-            raise UnknownNameError("joint", name, "the motion", names)
     chosen = names if joints is None else list(joints)
+    if unknown := sorted({*chosen} - {*names}):
+        raise UnknownNameError("joint", unknown[0], "the motion", names)
     panels = figure(len(chosen), "", height=1.1).axes if axes is None else list(axes)
-    time = as_array(motion.time)
     for name, panel in zip(chosen, panels, strict=True):
-        at = names.index(name)
-        values = as_array(motion.joints[:, at])
-        [curve] = panel.plot(time, values, **line)
+        _plot_joint(panel, motion, names.index(name), **line)
         panel.set_ylabel(name, fontsize="small")
-        if isinstance(motion, Trajectory):
-            band = 2 * as_array(motion.covariance[:, at, at]).clip(min=0) ** 0.5
-            color = curve.get_color()
-            panel.fill_between(time, values - band, values + band, color=color, alpha=0.2, lw=0)
-            continue
-        for event, instant in motion.events.items():
+    for event, instant in getattr(motion, "events", {}).items():
+        for panel in panels:
             panel.axvline(instant, color="0.7", linewidth=0.8, zorder=0)
-            if panel is panels[0]:
-                place = (instant, 1), ("data", "axes fraction")
-                panel.annotate(event, place[0], xycoords=place[1], fontsize="x-small")
+        place = ("data", "axes fraction")
+        panels[0].annotate(event, (instant, 1), xycoords=place, fontsize="x-small")
     return panels
+
+
+def _plot_joint(
+    panel: Axes, motion: Demonstration | Trajectory, joint: int, **line: Any
+) -> None:
+    """Draw a joint over time, in a trajectory with its band."""
+    time, values = as_array(motion.time), as_array(motion.joints[:, joint])
+    [curve] = panel.plot(time, values, **line)
+    if isinstance(motion, Trajectory):
+        band = 2 * as_array(motion.covariance[:, joint, joint]).clip(min=0) ** 0.5
+        color = curve.get_color()
+        panel.fill_between(time, values - band, values + band, color=color, alpha=0.2, lw=0)
 
 
 def plot_components(
@@ -295,11 +298,11 @@ def plot_local(
         look = {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, "label": "reproduction"}
         shown.append((motion, {**look, **style}))
 
-    def expected(_operator: int, time: Tensor) -> Tensor:
+    def estimate(_operator: int, time: Tensor) -> Tensor:
         return model.skill.expected(operator, time)
 
     motions = [motion for motion, _ in shown]
-    rows = local_data(motions, [chosen], model.kinematics_, expected, model.holds_)
+    rows = local_data(motions, [chosen], model.kinematics_, estimate, model.holds_)
     for row, (_, style) in zip(rows, shown, strict=True):
         axes.plot(as_array(row[:, 0]), as_array(row[:, 1 + column]), **style)
     plot_components(axes, model, operator, column)
@@ -308,7 +311,7 @@ def plot_local(
 def plot_candidates(
     axes: Axes, trajectory: Trajectory, joint: str, labels: Sequence[str] = ()
 ) -> None:
-    """Figure 6: each operator's estimate of one joint, with its envelope, and the result.
+    """Draw figure 6: each operator's estimate of a joint, its envelope, and the result.
 
     Parameters
     ----------
@@ -336,7 +339,7 @@ def plot_candidates(
 
 
 def plot_relevance(axes: Axes, selection: SelectOperators) -> None:
-    """When which candidate matters: gains over time, those kept above, in bold.
+    """Draw when which candidate matters: gains over time, those kept above, in bold.
 
     Parameters
     ----------
@@ -365,7 +368,7 @@ def plot_relevance(axes: Axes, selection: SelectOperators) -> None:
 def plot_parts(
     axes: Axes, segmentation: Segmentation, demonstrations: Sequence[Demonstration]
 ) -> None:
-    """Where parts begin and end: a bar per demonstration, and above them why.
+    """Draw where parts begin and end: a bar per demonstration, and above them why.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ from tpgmm_tools.viewing import write_motion
 from tpgmm_tools.viewing.curves import motion_marks, turning_joints
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.checks.summary import UNLIKELY
-from tpgmm_torch.data.arrays import as_array
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -39,15 +39,6 @@ __all__ = ["LeftOut", "leave_one_out", "write_report"]
 DRAWN = 4
 #: A joint is near its limit within this share of its range, or of its speed.
 NEAR = 0.1
-STYLE = """
-:root{color-scheme:light dark}
-body{font:16px/1.5 system-ui,sans-serif;max-width:60em;margin:auto;padding:1em}
-table{border-collapse:collapse;display:block;overflow-x:auto;margin:1em 0}
-.n,td:first-child{white-space:nowrap}
-td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #8884}
-img,iframe{width:100%;border:0;background:#fff}div{overflow-x:auto}img{min-width:40em}
-iframe{height:32em}@media (max-width:40em){iframe{height:48em}}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +116,7 @@ def leave_one_out(
 
 
 def _instants(shown: Demonstration) -> dict[str, float]:
-    """When a link's pose matters: events, and begin and end of holds."""
+    """Return when a link's pose matters: events, and begin and end of holds."""
     ends = {"end": float(shown.time[-1])}
     holds = {
         f"{hold.frame} is {what}": at
@@ -171,6 +162,8 @@ def write_report(
     -------
     list of LeftOut
     """
+    from markdown_it import MarkdownIt
+
     left_out = leave_one_out(model, demonstrations, most, progress)
     situations = [Situation.of(one) for one in demonstrations]
     with warnings.catch_warnings():
@@ -181,8 +174,8 @@ def write_report(
         ]
     joints, near = _joints(model, motions)
     touching, touched = _obstacles(model, situations, motions, how.get("obstacles"))
-    card = {name: _rendered(text) for name, text in sections(model).items()}
-    understood, shares, limits, _, learning = card.values()
+    render = MarkdownIt("commonmark").enable("table").render
+    understood, shares, limits, _, learning = map(render, sections(model).values())
     parts = {
         "At a glance": _list([*_glance(left_out), *near, *touching]),
         "What was understood": understood + _events(model, motions[situation]),
@@ -196,9 +189,10 @@ def write_report(
         "How it was learned": learning,
     }
     text = "".join(f"<h2>{name}</h2>{part}" for name, part in parts.items() if part)
+    style = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
     page = (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f'<meta name=viewport content="width=device-width"><style>{STYLE}</style>'
+        f'<meta name=viewport content="width=device-width"><style>\n{style}</style>'
         f"<h1>{html.escape(title)}</h1>{text}</html>"
     )
     with replacing(path) as new:
@@ -206,21 +200,24 @@ def write_report(
     return left_out
 
 
-def _errors(
+def _quantiles(
     left_out: Sequence[LeftOut], first: int
-) -> Iterable[tuple[tuple[str, ...], list[tuple[float, float]]]]:
-    """All errors by link and event, or from the ``first`` of these on."""
+) -> Iterator[tuple[tuple[str, ...], Array, int]]:
+    """Compute medians and 90th percentiles of errors, by link and event or the event alone.
+
+    Yields the place (from its ``first`` part on), mm and degrees of each, and their number.
+    """
     at: dict[tuple[str, ...], list[tuple[float, float]]] = {}
     for one in left_out:
         for place, errors in one.errors.items():
             at.setdefault(place[first:], []).append(errors)
-    return at.items()
+    for where, pairs in at.items():
+        yield where, np.quantile(pairs, [0.5, 0.9], axis=0), len(pairs)
 
 
 def _glance(left_out: Sequence[LeftOut]) -> Iterator[str]:
-    """Errors at events, and episodes that are unlike the others."""
-    for (event,), pairs in _errors(left_out, 1):
-        (mm, deg), (most, _) = np.quantile(pairs, [0.5, 0.9], axis=0)
+    """Say how large errors at events are, and which episodes are unlike the others."""
+    for [event], ((mm, deg), (most, _)), _ in _quantiles(left_out, 1):
         yield (
             f"At '{event}' links are {mm:.2g} mm and {deg:.2g} deg from where an episode that "
             f"was left out has them (median; 90\u00a0% within {most:.2g} mm)."
@@ -239,13 +236,11 @@ def _events(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
 
 
 def _exactness(left_out: Sequence[LeftOut]) -> str:
-    """Errors by link and event, over the demonstrations that were left out."""
-    rows = []
-    for (link, event), pairs in _errors(left_out, 0):
-        (mm, deg), (mm_90, deg_90) = np.quantile(pairs, [0.5, 0.9], axis=0)
-        rows.append(
-            [link, event, f"{mm:.2g} / {mm_90:.2g}", f"{deg:.2g} / {deg_90:.2g}", len(pairs)]
-        )
+    """Show errors by link and event, over the demonstrations that were left out."""
+    rows = [
+        [*place, f"{mm:.2g} / {mm_90:.2g}", f"{deg:.2g} / {deg_90:.2g}", count]
+        for place, ((mm, deg), (mm_90, deg_90)), count in _quantiles(left_out, 0)
+    ]
     text = (
         f"<p>Each of {len(left_out)} episodes was left out once, the model learned from the "
         "others, and reproduced in its situation: median / 90th percentile.</p>"
@@ -254,7 +249,7 @@ def _exactness(left_out: Sequence[LeftOut]) -> str:
 
 
 def _decides(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
-    """Figure 6 of the paper, for the joints that move most."""
+    """Draw figure 6 of the paper, for the joints that move most."""
     moves = np.ptp(as_array(trajectory.joints), axis=0)
     chosen = np.sort(np.argsort(moves)[-DRAWN:])
     drawing = figure(len(chosen), "", height=1.6)
@@ -274,39 +269,49 @@ def _decides(model: TaskParameterizedGMM, trajectory: Trajectory) -> str:
 def _joints(
     model: TaskParameterizedGMM, motions: Sequence[Trajectory]
 ) -> tuple[str, list[str]]:
-    """Ranges and speeds of the joints, and sentences about those near their limits."""
-    robot, rows, near = model.kinematics_, [], []
+    """Show ranges and speeds of the joints, and say which are near their limits."""
+    robot, rows, near = model.kinematics_, [], list[str]()
     every = np.concatenate([as_array(one.joints) for one in motions])
     fastest = np.max([as_array(largest_speeds(one)) for one in motions], axis=0)
     low, high, limit = map(as_array, (robot.lower, robot.upper, robot.velocity))
     for j, name in enumerate(robot.joint_names):
         unit, least, most = _unit(model, j), every[:, j].min(), every[:, j].max()
-        room = float(min(least - low[j], high[j] - most))
-        close = np.isfinite(room) and room < NEAR * (high[j] - low[j])
-        fast = fastest[j] > (1 - NEAR) * limit[j]
-        if close:
-            how = "comes within" if room >= 0 else "goes beyond its limit, by"
-            end = " of its limit" * (room >= 0)
-            near.append(f"{name} {how} {abs(room):.3f} {unit}{end}.")
-        if fast:
-            near.append(f"{name} reaches {fastest[j]:.2f} of {limit[j]:.2f} {unit}/s.")
+        said = [
+            *_near_position(name, unit, least - low[j], high[j] - most, high[j] - low[j]),
+            *_near_speed(name, unit, fastest[j], limit[j]),
+        ]
+        near += said
         texts = f"{low[j]:.2f} to {high[j]:.2f}", f"{fastest[j]:.2f}", f"{limit[j]:.2f}"
         known = (text.replace("inf", "\u221e") for text in texts)
-        said = "near" if close or fast else ""
-        rows.append([name, unit, f"{least:.2f} to {most:.2f}", *known, said])
+        rows.append([name, unit, f"{least:.2f} to {most:.2f}", *known, "near" if said else ""])
     head = ["joint", "unit", "moves", "may", "fastest", "limit", "limits"]
     text = (
         "<p>In the situations of all episodes, within the robot's bounds; speeds per second. "
         f"Near is within {NEAR:.0%} of the range, or of the speed.</p>"
     )
-    none = ["No joint comes near its limits of position or speed."]
+    none = "No joint comes near its limits of position or speed."
     if not np.isfinite([low, high, limit]).any():
-        none = ["Limits of the joints are not known: no robot was given."]
-    return text + _table(head, rows), near or none
+        none = "Limits of the joints are not known: no robot was given."
+    return text + _table(head, rows), near or [none]
+
+
+def _near_position(name: str, unit: str, below: float, above: float, span: float) -> list[str]:
+    room = float(min(below, above))
+    if not np.isfinite(room) or room >= NEAR * span:
+        return []
+    if room < 0:
+        return [f"{name} goes beyond its limit, by {-room:.3f} {unit}."]
+    return [f"{name} comes within {room:.3f} {unit} of its limit."]
+
+
+def _near_speed(name: str, unit: str, fastest: float, limit: float) -> list[str]:
+    if fastest <= (1 - NEAR) * limit:
+        return []
+    return [f"{name} reaches {fastest:.2f} of {limit:.2f} {unit}/s."]
 
 
 def _unit(model: TaskParameterizedGMM, joint: int) -> str:
-    """Of a joint; parts of quaternions have none, and joints alone say nothing."""
+    """Return a joint's unit: 1 for parts of quaternions; of joints alone it is not known."""
     robot = model.kinematics_
     if not robot.links:
         return "rad or m"
@@ -319,7 +324,7 @@ def _obstacles(
     motions: Sequence[Trajectory],
     scene: Scene | None,
 ) -> tuple[list[str], str]:
-    """A sentence, and what touches what in each motion; nothing without a scene."""
+    """Say and list what touches what in each motion; nothing without a scene."""
     if scene is None:
         return [], ""
     rows = [
@@ -335,22 +340,16 @@ def _obstacles(
 
 
 def _demonstrations(left_out: Sequence[LeftOut]) -> str:
-    rows = [
-        [
-            one.index,
-            f"{one.novelty:.2f}",
-            f"{one.path:.3f}",
-            max((round(mm, 1) for mm, _ in one.errors.values()), default="-"),
-        ]
-        for one in left_out
-    ]
+    rows = []
+    for one in left_out:
+        worst = max((round(mm, 1) for mm, _ in one.errors.values()), default="-")
+        rows.append([one.index, f"{one.novelty:.2f}", f"{one.path:.3f}", worst])
     text = (
         "<p>Novelty is how far an episode's situation is from the others, in units of the "
         f"furthest of these; above {UNLIKELY} it is unlike them.</p>"
     )
     return text + _table(
-        ["episode", "novelty", "path [rad or m]", "worst at an event [mm]"],
-        rows,
+        ["episode", "novelty", "path [rad or m]", "worst at an event [mm]"], rows
     )
 
 
@@ -361,7 +360,7 @@ def _moving(
     title: str,
     how: Mapping[str, Any],
 ) -> str:
-    """The moving picture; nothing for a model without links."""
+    """Embed the moving picture; nothing for a model without links."""
     if not model.kinematics_.links:
         return ""
     with tempfile.TemporaryDirectory() as folder:
@@ -369,14 +368,6 @@ def _moving(
         write_motion(place, model, situation, demonstrations, title=title, **how)
         page = html.escape(place.read_text(encoding="utf-8"), quote=True)
     return f'<iframe title="the motion" loading=lazy srcdoc="{page}"></iframe>'
-
-
-def _rendered(text: str) -> str:
-    """Markdown as HTML."""
-    from markdown_it import MarkdownIt
-
-    rendered: str = MarkdownIt("commonmark").enable("table").render(text)
-    return rendered
 
 
 def _picture(drawing: Any) -> str:

@@ -1,11 +1,7 @@
 """The page: what its buttons answer, and the whole of it, served."""
 
 import html
-import os
 import re
-import signal
-import subprocess
-import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support import browser, skills
-from tests.support.command_line import UPPER_BODY, refusal
+from tests.support import browser
+from tests.support.command_line import UPPER_BODY, refusal, serve
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_datasets import save_lerobot
@@ -29,18 +25,13 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def bottles():
-    return skills.generator().demonstrations(2)
-
-
-@pytest.fixture(scope="module")
 def table(tmp_path_factory, bottles):
     path = tmp_path_factory.mktemp("tables") / "shake.csv"
     write_table(demonstrations_to_frame(bottles), path)
     return str(path)
 
 
-def learned(shown, n_components=4):
+def learn(shown, n_components=4):
     given = {"mine": lambda: (shown, upper_body())}
     return page.learn("mine", None, "none", None, "", "", n_components, given)
 
@@ -62,7 +53,7 @@ def test_a_table_becomes_a_moving_picture_and_files(table, tmp_path):
     with zipfile.ZipFile(model) as archive:
         archive.extractall(tmp_path)
     again = load_model(tmp_path / "model")
-    there = page.moved(situation, [place])
+    there = page.move_objects(situation, [place])
     [same] = rollout(again.skill, [there], bounds="robot", blend=1.0)
     columns = read_table(motion)[list(same.joint_names)]
     np.testing.assert_allclose(columns, same.joints, atol=1e-9)
@@ -96,9 +87,9 @@ def test_without_links_or_a_skill_there_is_nothing_to_show(table):
 
 def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwarn):
     degrees = [replace(d, joints=d.joints.rad2deg()) for d in bottles]
-    skill, report = learned(degrees)
+    skill, report = learn(degrees)
     assert skill is None and "degrees" in report
-    _, report = learned([*bottles, bottles[0]])
+    _, report = learn([*bottles, bottles[0]])
     assert "**To be looked at:**\n- " in report and "copy of" in report
     assert not len(recwarn)
     with pytest.raises(ZeroDivisionError):  # no error that a user can mend
@@ -108,7 +99,7 @@ def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwa
 def test_objects_are_turned_about_the_vertical_through_them():
     lying = Frame([0.1, 0.2, 0.3], quaternions.exp(torch.tensor([0.0, np.pi / 2, 0.0])))
     situation = Situation([0.0], {"cup": lying, "belt": Frame(np.zeros((5, 3)))})
-    frame = page.moved(situation, [("cup", "0.4", 0, 1, 90)]).frames["cup"]
+    frame = page.move_objects(situation, [("cup", "0.4", 0, 1, 90)]).frames["cup"]
     np.testing.assert_allclose(frame.position, (0.4, 0, 1))
     point = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -116,42 +107,27 @@ def test_objects_are_turned_about_the_vertical_through_them():
     np.testing.assert_allclose(frame.transform(point) - frame.position, expected, atol=1e-12)
     for place in ((1, 2, 3), (1, 2, 3, None), (1, 2, 3, "a"), (1, 2, 3, np.nan)):
         with pytest.raises(DataError, match="cup: a place is x, y, z in metres and a turn"):
-            page.moved(situation, [("cup", *place)])
+            page.move_objects(situation, [("cup", *place)])
     for name in ("belt", "mug"):
         with pytest.raises(UnknownNameError, match=rf"{name}.*cup"):
-            page.moved(situation, [(name, 0, 0, 0, 0)])
+            page.move_objects(situation, [(name, 0, 0, 0, 0)])
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory, bottles):
-    """The page's address; in a process of its own, as gradio leaves its event loop open."""
+def url(tmp_path_factory, bottles):
+    """Serve the page, in a process of its own, as gradio leaves its event loop open."""
     folder = tmp_path_factory.mktemp("served") / "mine"
     save_lerobot(bottles, folder, fps=20, task="shake")
-    command = [sys.executable, "-c", "from tpgmm_tools.cli import main; main()", "app"]
     temporary = tmp_path_factory.mktemp("temporary")
-    with subprocess.Popen(
-        [*command, str(folder), *UPPER_BODY, "--port", "0"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"TMPDIR": str(temporary)},
-        # what a shell starts in the background would else ignore Ctrl-C
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        try:
-            line = process.stdout.readline()
-            yield re.fullmatch(r"open (http://127\.0\.0\.1:\d+/) in a browser.*\n", line)[1]
-            process.send_signal(signal.SIGINT)
-            assert process.wait(60) == 0
-            left = [path for path in temporary.rglob("*") if path.is_file()]
-            assert not left, "the page cleans up"
-        finally:
-            process.kill()
+    with serve("app", folder, *UPPER_BODY, "--port", 0, TMPDIR=str(temporary)) as url:
+        yield url
+    assert not [path for path in temporary.rglob("*") if path.is_file()], "the page cleans up"
 
 
-def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(served):
+def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(url):
     assert "describes DATASET" in refusal("app", *UPPER_BODY)
     with browser.page(1200, 1000) as shown:
-        shown.open(served)
+        shown.open(url)
         button = "[...document.querySelectorAll('button')].find(b => b.innerText == '{}')"
         learn, show = button.format("Learn"), button.format("Show")
         shown.wait_for(f"!!{learn}")
@@ -163,5 +139,5 @@ def test_in_a_browser_the_robot_moves_and_nothing_is_fetched_from_elsewhere(serv
         shown.evaluate("document.querySelector('iframe').scrollIntoView({block: 'center'})")
         browser.draws(shown)
         assert shown.complaints == []
-        local = (served, "data:", "blob:")
+        local = (url, "data:", "blob:")
         assert [one for one in shown.requests if not one.startswith(local)] == []

@@ -6,7 +6,6 @@ import zipfile
 import numpy as np
 import pytest
 
-from tests.support import skills
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.tables import demonstrations_to_frame, write_table
@@ -15,13 +14,8 @@ from tpgmm_torch.exceptions import DataError
 
 
 @pytest.fixture(scope="module")
-def bottles():
-    return skills.generator().demonstrations(2)
-
-
-@pytest.fixture(scope="module")
 def archive(tmp_path_factory, bottles):
-    """A data set as somebody would zip its folder."""
+    """Write a data set as somebody would zip its folder."""
     place = tmp_path_factory.mktemp("sets")
     save_lerobot(bottles, place / "above" / "dataset", fps=20, task="shake")
     return shutil.make_archive(str(place / "mine"), "zip", place / "above")
@@ -29,8 +23,8 @@ def archive(tmp_path_factory, bottles):
 
 def test_a_zipped_data_set_is_read_with_the_robots_joints(archive, bottles):
     with pytest.raises(DataError, match=r"poses\.csv is not in the set"):
-        sources.uploaded([archive], upper_body(), ["cup=/etc/poses.csv"])
-    read = sources.uploaded([archive], upper_body())
+        sources.read_uploads([archive], upper_body(), ["cup=/etc/poses.csv"])
+    read = sources.read_uploads([archive], upper_body())
     assert len(read) == 2
     for one, other in zip(read, bottles, strict=True):
         np.testing.assert_allclose(one.joints, other.joints, atol=1e-6)
@@ -44,7 +38,7 @@ def test_tables_are_read_one_demonstration_each_or_several(tmp_path, bottles, su
     one, both = tmp_path / f"b{suffix}", tmp_path / f"a{suffix}"
     write_table(demonstrations_to_frame(bottles[:1]).drop(columns="episode"), one)
     write_table(demonstrations_to_frame(bottles), both)
-    read = sources.uploaded([one, both])
+    read = sources.read_uploads([one, both])
     assert [len(demonstration) for demonstration in read] == [
         len(bottles[0]), len(bottles[1]), len(bottles[0])
     ]  # fmt: skip
@@ -65,7 +59,7 @@ def test_other_files_are_refused(tmp_path, names, complaint):
     for name in names:
         (tmp_path / name).write_text("nothing")
     with pytest.raises(DataError, match=complaint):
-        sources.uploaded([tmp_path / name for name in names])
+        sources.read_uploads([tmp_path / name for name in names])
 
 
 @pytest.mark.parametrize(("count", "complaint"), [(0, "holds no"), (2, "holds 2")])
@@ -74,7 +68,7 @@ def test_an_archive_holds_one_data_set(tmp_path, count, complaint):
         for number in range(count):
             opened.writestr(f"{number}/meta/info.json", "{}")
     with pytest.raises(DataError, match=complaint):
-        sources.uploaded([tmp_path / "x.zip"])
+        sources.read_uploads([tmp_path / "x.zip"])
 
 
 def test_an_archive_that_would_fill_the_disk_is_not_unpacked(tmp_path, monkeypatch):
@@ -83,7 +77,7 @@ def test_an_archive_that_would_fill_the_disk_is_not_unpacked(tmp_path, monkeypat
         opened.writestr("meta/info.json", "0" * 100_000)
     assert (tmp_path / "x.zip").stat().st_size < 1000
     with pytest.raises(DataError, match=r"x\.zip unpacks to"):
-        sources.uploaded([tmp_path / "x.zip"])
+        sources.read_uploads([tmp_path / "x.zip"])
 
 
 def test_names_that_lead_out_of_the_folder_stay_in_it(tmp_path, archive):
@@ -91,6 +85,6 @@ def test_names_that_lead_out_of_the_folder_stay_in_it(tmp_path, archive):
     shutil.copy(archive, evil)
     with zipfile.ZipFile(evil, "a") as opened:
         opened.writestr("../../escaped.txt", "out")
-    assert len(sources.uploaded([evil], upper_body())) == 2
+    assert len(sources.read_uploads([evil], upper_body())) == 2
     assert not list(tmp_path.rglob("escaped.txt"))
     assert not (tmp_path.parent / "escaped.txt").exists()

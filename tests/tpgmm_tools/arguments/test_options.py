@@ -1,6 +1,8 @@
 """Options made from signatures, in groups, and what their texts mean."""
 
 import inspect
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import pytest
 import typer
@@ -8,30 +10,35 @@ from typer.testing import CliRunner
 
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.arguments import options
+from tpgmm_tools.cli.fit import CHOSEN, ModelOptions
 from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
 
-class Made:
-    """Something.
+@dataclass(frozen=True)
+class Group:
+    """Made.
 
     Parameters
     ----------
-    share : float, default=0.5
-        How much, see :func:`~tpgmm.other`. More than a help needs.
-    kind, other : str
+    share : float
+        How much, see :func:`~tpgmm.other`. All of it.
+    kind : ``KIND``
         Of both ``kinds`` [m].
     strict : bool
+        Refuse more.
     """
 
-    def __init__(self, share=0.5, kind="a", other=None, strict=False):
-        pass
+    share: float = 0.5
+    kind: Any = "a"
+    strict: bool = False
 
 
 def test_options_follow_signature_and_docstring():
     app, given = typer.Typer(), {}
 
-    @options.command(app, "tpgmm made", options.options_of(Made, "Made", {"other"}))
-    def made(place, *, data: options.DataOptions, count_: int = 2, **settings):
+    @options.command(app, "tpgmm made")
+    def made(place, *, data: options.DataOptions, group: Group, count_: int = 2):
         """Make one.
 
         Parameters
@@ -41,7 +48,7 @@ def test_options_follow_signature_and_docstring():
         count_ : int >= 1
             How many.
         """
-        given.update(settings, place=place, count=count_, rate=data.rate, frames=data.frame)
+        given.update(vars(group), place=place, count=count_, rate=data.rate, frames=data.frame)
 
     def run(*arguments):
         return CliRunner().invoke(app, arguments)
@@ -55,10 +62,9 @@ def test_options_follow_signature_and_docstring():
     assert (given["frames"], given["count"], given["share"]) == (["a", "b"], 3, 0.5)
     assert run("out", "--count", "0").exit_code == 2
     text = " ".join(run("--help-all").output.split())
-    assert "How much, see tpgmm.other. [default: 0.5]" in text
-    assert "Of both kinds [m]." in text and "--other" not in text
+    assert "Made: --share NUMBER How much, see tpgmm.other. All of it. [default: 0.5]" in text
+    assert "--kind KIND Of both kinds [m]." in text and "Parameters" not in text
     assert "Make one." in text and "Usage: made DIR [OPTIONS]" in text
-    assert "Parameters" not in text
     short = run("--help").output
     assert "--frame NAME[=SOURCE]" in short and "--share" not in short
 
@@ -70,14 +76,18 @@ def test_values_are_numbers_or_words(text, value):
     assert options.value(text) == value
 
 
-def test_fit_has_the_estimators_defaults():
-    from tpgmm_tools.cli.fit import SETTINGS, fit
-
-    estimator = inspect.signature(TaskParameterizedGMM).parameters
-    shared = {one.name: one.default for one in SETTINGS}
-    shared["n_components"] = inspect.signature(fit).parameters["n_components"].default
-    assert {"tol", "reg_covar", "covariance_type"} <= shared.keys()
-    assert shared == {name: estimator[name].default for name in shared}
+def test_fit_has_the_estimators_parameters_and_defaults():
+    """They are stated once more, so that the help loads no estimator."""
+    estimator = inspect.signature(TaskParameterizedGMM).parameters.items()
+    shared = {
+        name: one.default for name, one in estimator if name not in ("operators", "robot")
+    }
+    stated = {name: one for name, one in asdict(ModelOptions()).items() if name not in CHOSEN}
+    made = ModelOptions().model([], None)
+    assert stated == shared | {"fusion": "information", "random_state": 0}
+    assert made.fusion == InformationFusion()
+    covariance = ModelOptions(fusion="covariance", epsilon=0.1).model([], None).fusion
+    assert covariance == CovarianceFusion(0.1)
 
 
 def test_robots_are_files_of_either_format_or_come_with_the_package(tmp_path):

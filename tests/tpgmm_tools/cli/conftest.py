@@ -16,7 +16,7 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def fitted(dataset, tmp_path_factory):
+def bottle_model(dataset, tmp_path_factory):
     """Folder of a model, and what fitting it printed."""
     folder = tmp_path_factory.mktemp("fit") / "model"
     options = ("--n-components", 6, "--reg-covar", 1e-5, "--fusion", "covariance")

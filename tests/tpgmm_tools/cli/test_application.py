@@ -11,9 +11,13 @@ import typer
 
 from tests.support.command_line import output, refusal, run
 from tpgmm_tools.arguments import plugins
+from tpgmm_tools.cli.application import app
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 
-COMMANDS = ["demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset"]
+COMMANDS = [
+    "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset",
+    "camera", "calibrate",
+]  # fmt: skip
 DESCRIBE = "tpgmm_datasets.description.describe_lerobot"
 
 
@@ -26,29 +30,43 @@ def test_version_and_help_need_no_command():
         assert "Run the paper's experiment" in text and "Learn a skill from" in text
 
 
-@pytest.mark.parametrize(
-    "command",
-    COMMANDS[:-1] + [f"dataset {n}" for n in ("info", "check", "plot", "generate", "convert")],
-)
+def leaves(command, path=()):
+    """Find the names that lead to each command that does something."""
+    context = typer.Context(command)
+    for name in getattr(command, "list_commands", lambda _: ())(context):
+        _, inner, _ = command.resolve_command(context, [name])
+        yield from leaves(inner, (*path, name))
+    if not hasattr(command, "list_commands"):
+        yield path
+
+
+EVERY = [path for path in leaves(typer.main.get_command(app)) if path[0] in COMMANDS]
+
+
+@pytest.mark.parametrize("command", EVERY, ids=" ".join)
 def test_the_help_of_every_command_has_an_example(command):
-    every = output(*command.split(), "--help-all")
-    text = output(*command.split(), "--help")
+    every, text = (output(*command, option) for option in ("--help-all", "--help"))
     for lines in (text.splitlines(), every.splitlines()):
         assert max(map(len, lines)) <= 80
     assert len(text.splitlines()) <= 40 <= 40 + every.count("--") - text.count("--")
-    assert f"Example: tpgmm {command}" in text and "…" not in text
+    assert f"Example: tpgmm {' '.join(command)}" in text and "…" not in text
 
 
-def test_help_needs_none_of_the_heavy_packages():
-    script = """
+def test_the_help_of_every_command_needs_none_of_the_heavy_packages():
+    script = f"""
 import sys
 from tpgmm_tools.cli.application import app
-app(["--help"], standalone_mode=False)
-heavy = {"torch", "sklearn", "pandas", "pyarrow", "matplotlib", "lerobot"} & set(sys.modules)
-sys.exit(f"{sorted(heavy)} are imported" if heavy else 0)
+for command in {[(), *EVERY]}:
+    app([*command, "--help"], standalone_mode=False)
+print(*sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    heavy = {
+        "av", "cv2", "gradio", "lerobot", "matplotlib", "mujoco", "numpy", "pandas", "pyarrow",
+        "scipy", "sklearn", "torch", "trimesh", "viser",
+    }  # fmt: skip
+    assert heavy & {*done.stdout.splitlines()[-1].split()} == set()
 
 
 @pytest.mark.parametrize(
@@ -87,6 +105,12 @@ def test_debug_and_what_no_user_can_mend_keep_the_traceback(monkeypatch):
     assert isinstance(result.exception, ModelFileError)
     monkeypatch.setattr(DESCRIBE, lambda path: 1 / 0)
     assert isinstance(run("dataset", "check", "x").exception, ZeroDivisionError)
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gradio", None)
+    said = "this command needs gradio: pip install 'tpgmm-torch[app]'"
+    assert refusal("app") == f"tpgmm: {said}"
 
 
 def test_warnings_and_missing_packages_are_one_line_each(monkeypatch):

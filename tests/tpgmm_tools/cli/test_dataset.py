@@ -35,7 +35,7 @@ def generate(path, *more, number=2, seed=0, rate=RATE):
 
 
 @pytest.fixture(scope="module")
-def generated(tmp_path_factory):
+def shaking(tmp_path_factory):
     folder = tmp_path_factory.mktemp("generated") / "set"
     output(*generate(folder))
     return folder
@@ -43,7 +43,7 @@ def generated(tmp_path_factory):
 
 @pytest.fixture
 def arm(tmp_path):
-    """A small set of three episodes in layout v3.0, and what is in it."""
+    """Write a small set of three episodes in layout v3.0, and what is in it."""
     return tmp_path / "arm", write(tmp_path / "arm")
 
 
@@ -75,9 +75,9 @@ def test_generated_demonstrations_are_those_of_the_skill_with_that_seed(tmp_path
 
 
 @pytest.mark.parametrize("command", ["generate", "convert"])
-def test_a_set_that_exists_is_left_alone_without_append(command, generated, arm, tmp_path):
+def test_a_set_that_exists_is_left_alone_without_append(command, shaking, arm, tmp_path):
     root, written = arm
-    words = generate(root) if command == "generate" else ("dataset", "convert", generated, root)
+    words = generate(root) if command == "generate" else ("dataset", "convert", shaking, root)
     assert f"{root} exists; remove it, or" in refusal(*words)
     assert_same(load_lerobot(root), written)
 
@@ -130,12 +130,12 @@ def test_an_episode_that_has_not_one_task_of_its_own_needs_to_be_told(arm, tmp_p
     assert len(load_lerobot(tmp_path / "new", episodes="wave")) == 3
 
 
-def test_joints_of_a_robot_are_chosen_in_its_order(generated, tmp_path):
+def test_joints_of_a_robot_are_chosen_in_its_order(shaking, tmp_path):
     robot = ("--robot", "upper_body", "--robot-joint", "r_*", "--link", "r_hand")
     at = ("--frame", "held=r_hand@grasp")
-    output("dataset", "convert", generated, tmp_path / "new", *robot, *at)
+    output("dataset", "convert", shaking, tmp_path / "new", *robot, *at)
     for found, before in zip(
-        load_lerobot(tmp_path / "new"), load_lerobot(generated), strict=True
+        load_lerobot(tmp_path / "new"), load_lerobot(shaking), strict=True
     ):
         names = [name for name in before.joint_names if name.startswith("r_")]
         assert list(found.joint_names) == names
@@ -146,11 +146,11 @@ def test_joints_of_a_robot_are_chosen_in_its_order(generated, tmp_path):
 PNG = b"\x89PNG"
 
 
-def test_info_and_plot_show_what_is_in_it(generated, tmp_path):
-    text = output("dataset", "info", generated)
+def test_info_and_plot_show_what_is_in_it(shaking, tmp_path):
+    text = output("dataset", "info", shaking)
     for expected in ("v3.0", "10 rows per second", "bottle.qw", "l_shoulder_pitch", "rad"):
         assert expected in text
-    output("dataset", "plot", generated, "--out", tmp_path / "d.png")
+    output("dataset", "plot", shaking, "--out", tmp_path / "d.png")
     assert (tmp_path / "d.png").read_bytes().startswith(PNG)
 
 
@@ -164,9 +164,9 @@ def test_check_lists_all_problems_and_fails(tmp_path):
     assert "problem: " in output("dataset", "info", tmp_path / "b")
 
 
-def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, generated):
+def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, shaking):
     robot = ("--robot", "upper_body", "--link", "l_hand")
-    text = output("dataset", "check", generated, *robot, "--strict")
+    text = output("dataset", "check", shaking, *robot, "--strict")
     assert text.splitlines() == ["no problems in 2 episodes, 261 rows"]
     time = np.arange(10) / 10
     shown = [Demonstration(time, np.sin(time + n)[:, None]) for n in range(3)]
@@ -180,9 +180,9 @@ def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, gener
     assert result.exit_code == 2 and "is not among the values" in result.stderr
 
 
-def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, generated):
+def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, shaking):
     root = tmp_path / "one"
-    shutil.copytree(generated, root)
+    shutil.copytree(shaking, root)
 
     def stretch(poses):
         return np.concatenate((poses[:1] * np.repeat([1.0, 1.3], [3, 4]), poses[1:]))
@@ -195,7 +195,7 @@ def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, genera
         load_lerobot(root)
     with pytest.warns(DatasetWarning, match="norm of a quaternion"):
         [second] = load_lerobot(root, relax=["poses"])
-    assert_same([second], load_lerobot(generated)[1:])
+    assert_same([second], load_lerobot(shaking)[1:])
 
 
 def write_degrees(folder):

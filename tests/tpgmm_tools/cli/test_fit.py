@@ -26,8 +26,8 @@ from tpgmm_torch.robots import Poses
 QUICK = ("--n-components", 2, "--rate", 5, "--alignment", "none", "--plausibility", "ignore")
 
 
-def test_fit_saves_a_model_and_says_what_it_learned(fitted):
-    folder, text = fitted
+def test_fit_saves_a_model_and_says_what_it_learned(bottle_model):
+    folder, text = bottle_model
     model = load_model(folder)
     assert (model.n_components, model.reg_covar, model.fusion) == (6, 1e-5, CovarianceFusion())
     assert list(model.operators_) == default_operators(("l_hand", "r_hand"), ("bottle",))

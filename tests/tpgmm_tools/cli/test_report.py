@@ -15,8 +15,8 @@ from tpgmm_torch.persistence import save
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory):
-    """A folder with a model and what it was learned from."""
+def example(tmp_path_factory):
+    """Make a folder with a model and what it was learned from."""
     folder = tmp_path_factory.mktemp("report")
     shown = skills.generator().demonstrations(4)
     model = skills.small_bottle()
@@ -26,8 +26,8 @@ def learned(tmp_path_factory):
 
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_errors_are_those_of_models_that_were_learned_without(learned):
-    _, model, shown = learned
+def test_errors_are_those_of_models_that_were_learned_without(example):
+    _, model, shown = example
     found = leave_one_out(model, shown, most=3)
     assert [one.index for one in found] == [0, 2, 3]
     one = found[1]
@@ -42,8 +42,8 @@ def test_errors_are_those_of_models_that_were_learned_without(learned):
 
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_the_page_has_errors_candidates_limits_and_the_motion(learned):
-    folder, model, _ = learned
+def test_the_page_has_errors_candidates_limits_and_the_motion(example):
+    folder, model, _ = example
     arguments = "--dataset", folder / "dataset", "--alignment", "none"
     text = output("report", folder / "model", *arguments)
     page = (folder / "model.html").read_text(encoding="utf-8")
@@ -70,8 +70,8 @@ def test_the_page_has_errors_candidates_limits_and_the_motion(learned):
 
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_obstacles_are_drawn_and_what_touches_them_is_listed(learned, tmp_path):
-    folder, _, shown = learned
+def test_obstacles_are_drawn_and_what_touches_them_is_listed(example, tmp_path):
+    folder, _, shown = example
     x, y, z = shown[0].frames["bottle"].position.tolist()
     file = tmp_path / "scene.xml"
     file.write_text(
@@ -97,8 +97,8 @@ def test_joints_alone_have_no_limits_and_no_picture(tmp_path):
     assert "comes near" not in page and "<iframe" not in page and "<img" in page
 
 
-def test_what_cannot_be_left_out_is_an_error(learned, tmp_path):
-    folder, _, shown = learned
+def test_what_cannot_be_left_out_is_an_error(example, tmp_path):
+    folder, _, shown = example
     save_lerobot(shown[:2], tmp_path / "two", fps=20, task="shake")
     assert "to leave one out takes 3 demonstrations, there are 2" in refusal(
         "report", folder / "model", "--dataset", tmp_path / "two", "--alignment", "none"

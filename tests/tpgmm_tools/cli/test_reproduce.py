@@ -17,15 +17,17 @@ from tpgmm_torch.persistence import load_model
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])
-def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp_path, suffix):
+def test_reproductions_of_a_data_set_are_those_of_the_model(
+    dataset, bottle_model, tmp_path, suffix
+):
     out = tmp_path / "new" / f"r.{suffix}"
     printed = output(
-        "reproduce", fitted[0], "--dataset", dataset, "--episodes", "1:3", "--out", out
+        "reproduce", bottle_model[0], "--dataset", dataset, "--episodes", "1:3", "--out", out
     ).splitlines()
     assert len(printed) == 3
     assert all("rad/s^2" in line and "limit" in line for line in printed[:2])
     assert [path.name for path in out.parent.iterdir()] == [out.name]
-    model = load_model(fitted[0])
+    model = load_model(bottle_model[0])
     shown = load_lerobot(dataset, robot=model.kinematics_)[1:]
     situations = [Situation.of(one) for one in shown]
     expected = rollout(model.skill, situations, bounds="robot", blend=1.0)
@@ -39,48 +41,42 @@ def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp
     np.testing.assert_allclose(table[name], entries, atol=1e-12)
 
 
-def test_a_frame_that_the_data_set_does_not_tell_is_asked_for(dataset, fitted, tmp_path):
+def test_a_frame_that_the_data_set_does_not_tell_is_asked_for(dataset, bottle_model, tmp_path):
     told = refusal(
-        "reproduce", fitted[0], "--dataset", dataset, "--frame", "cup=observation."
+        "reproduce", bottle_model[0], "--dataset", dataset, "--frame", "cup=observation."
         "environment_state[0:7]", "--out", tmp_path / "r.csv",
     )  # fmt: skip
     assert "frame 'bottle' is not in" in told and "--frame bottle=LINK@EVENT" in told
     assert not (tmp_path / "r.csv").exists()
 
 
-def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
+def test_reproduce_takes_situations_from_a_file(bottle_model, tmp_path):
     file, out = tmp_path / "situations.json", tmp_path / "r.csv"
     situations = BottleShaking().situations(2)
-    items = [
-        {
-            "joints": s.joints.tolist(),
-            "frames": {
-                "bottle": {
-                    "position": s.frames["bottle"].position.tolist(),
-                    "orientation": s.frames["bottle"].orientation.tolist(),
-                }
-            },
+    items = []
+    for one in situations:
+        parts = {
+            k: getattr(one.frames["bottle"], k).tolist() for k in ("position", "orientation")
         }
-        for s in situations
-    ]
+        items.append({"joints": one.joints.tolist(), "frames": {"bottle": parts}})
     file.write_text(json.dumps(items))
-    output("reproduce", fitted[0], "--situations", file, "--out", out)
-    skill = load_model(fitted[0]).skill
+    output("reproduce", bottle_model[0], "--situations", file, "--out", out)
+    skill = load_model(bottle_model[0]).skill
     expected = rollout(skill, situations, bounds="robot", blend=1.0)
     joints = torch.cat([trajectory.joints for trajectory in expected])
     found = read_table(out)[list(skill.kinematics.joint_names)]
     np.testing.assert_allclose(found, joints, atol=1e-12)
     items[1]["frames"] = {"cup": items[1]["frames"]["bottle"]}
     file.write_text(json.dumps(items))
-    assert "bottle" in refusal("reproduce", fitted[0], "--situations", file, "--out", out)
+    assert "bottle" in refusal("reproduce", bottle_model[0], "--situations", file, "--out", out)
 
 
 def test_what_touches_an_obstacle_is_said_with_an_exit_code_of_its_own(
-    dataset, fitted, tmp_path
+    dataset, bottle_model, tmp_path
 ):
     scene, out = tmp_path / "scene.xml", tmp_path / "r.csv"
     arguments = (
-        "reproduce", fitted[0], "--dataset", dataset, "--episodes", "0", "--out", out,
+        "reproduce", bottle_model[0], "--dataset", dataset, "--episodes", "0", "--out", out,
         "--obstacles", scene,
     )  # fmt: skip
     assert "is an MJCF file" in run(*arguments).stderr

@@ -20,11 +20,11 @@ def test_models_are_joined(tmp_path):
     assert "lift is not a saved model" in told and not (tmp_path / "no").exists()
 
 
-def test_a_sequence_is_one_policy(dataset, fitted, tmp_path):
+def test_a_sequence_is_one_policy(dataset, bottle_model, tmp_path):
     pytest.importorskip("lerobot")  # `make oldest` is without it
     from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 
-    text, out = f"{fitted[0]} until arrived retry 1", tmp_path / "policy"
+    text, out = f"{bottle_model[0]} until arrived retry 1", tmp_path / "policy"
     assert "--dataset" in refusal("sequence", text, "--out", out, "--format", "lerobot")
     options = "--format", "lerobot", "--dataset", dataset, "--out", out
     output("sequence", text, *options)

@@ -2,16 +2,13 @@
 
 import json
 import re
-import signal
-import subprocess
-import sys
 import urllib.request
 
 import numpy as np
 import pytest
 
 from tests.support import skills
-from tests.support.command_line import output, refusal
+from tests.support.command_line import output, refusal, serve
 from tests.support.recordings import Recording
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch.persistence import save
@@ -19,7 +16,7 @@ from tpgmm_torch.persistence import save
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """A folder as ``tpgmm demo`` writes it."""
+    """Make a folder as ``tpgmm demo`` writes it."""
     folder = tmp_path_factory.mktemp("demo")
     save(skills.small_bottle(), folder / "model")
     demonstrations = skills.generator().demonstrations(2)
@@ -68,22 +65,8 @@ def test_view_refuses_what_it_cannot_show(demo, arguments, complaint):
 
 
 def test_live_the_command_serves_until_it_is_interrupted(demo):
-    command = [sys.executable, "-c", "from tpgmm_tools.cli import main; main()"]
-    command += ["view", str(demo), "--live", "--port", "0", "--fps", "2"]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        text=True,
-        # what a shell starts in the background would else ignore Ctrl-C
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        try:
-            line = process.stdout.readline()
-            url = re.fullmatch(r"open (http://127\.0\.0\.1:\d+) in a browser.*\n", line)[1]
-            with urllib.request.urlopen(url, timeout=60) as answer:
-                assert b"<title>Viser</title>" in answer.read()
-            process.send_signal(signal.SIGINT)
-            assert process.wait(60) == 0
-            assert process.stdout.read() == ""
-        finally:
-            process.kill()
+    with (
+        serve("view", demo, "--live", "--port", 0, "--fps", 2) as url,
+        urllib.request.urlopen(url, timeout=60) as answer,
+    ):
+        assert b"<title>Viser</title>" in answer.read()

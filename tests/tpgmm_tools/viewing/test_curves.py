@@ -16,7 +16,7 @@ from tpgmm_torch.persistence import load_model
 
 @pytest.fixture(scope="module")
 def bottle():
-    """The paper's skill and a reproduction."""
+    """Learn the paper's skill and make a reproduction."""
     model = skills.small_bottle()
     [trajectory] = model.predict([Situation.of(skills.few_bottles()[1])])
     return model, trajectory

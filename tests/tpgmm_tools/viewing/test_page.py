@@ -14,22 +14,22 @@ from tests.support.browser import draws, yellow
 from tests.support.recordings import Recording
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
-from tpgmm_tools.viewing import LiveView, write_motion
+from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
 from tpgmm_torch import Frame, Situation
 from tpgmm_torch.exceptions import DependencyError
 
 pytestmark = pytest.mark.slow
 
 
-def reproduced(model, situation):
-    """Within the robot's bounds, led in from the start posture."""
+def reproduce(model, situation):
+    """Reproduce within the robot's bounds, led in from the start posture."""
     [trajectory] = rollout(model.skill, [situation], bounds="robot", blend=1.0)
     return trajectory
 
 
 @pytest.fixture(scope="module")
 def motion(tmp_path_factory):
-    """A page, the reproduction in it, and the situation."""
+    """Write a page; return it, the reproduction in it, and the situation."""
     path = tmp_path_factory.mktemp("view") / "new" / "motion.html"
     shown = skills.few_bottles()
     situation = Situation.of(shown[1])
@@ -64,10 +64,16 @@ def test_links_and_objects_are_where_the_reproduction_has_them(motion):
     assert len(recording.props("/covariance/r_hand")["batched_positions"]) > 20
 
 
-def test_without_viser_the_error_names_the_extra(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[cli\]"):
-        write_motion(tmp_path / "m.html", skills.hands(), skills.new_handling()[0])
+@pytest.mark.parametrize(
+    ("write", "package", "extra"),
+    [(write_motion, "viser", "cli"), (write_rerun, "rerun", "rerun")],
+)
+def test_without_a_package_the_error_names_the_extra(
+    monkeypatch, tmp_path, write, package, extra
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(DependencyError, match=rf"tpgmm-torch\[{extra}\]"):
+        write(tmp_path / "motion", skills.hands(), skills.new_handling()[0])
 
 
 def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
@@ -82,9 +88,8 @@ def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
         page.wait_for(f"{clock} != {before}")
         # folded where there is little room; the marker goes with the time line
         assert page.evaluate("document.getElementById('curves').open") is False
-        marker = (
-            "parseFloat(document.querySelector('.now').getAttribute('transform')?.slice(10))"
-        )
+        now = "document.querySelector('.now').getAttribute('transform')"
+        marker = f"parseFloat({now}?.slice(10))"
         page.wait_for(f"{clock} > 0 && Math.abs({marker} - {clock}) < 0.5")
         outside = [url for url in page.requests if not url.startswith(("data:", "blob:"))]
         assert outside == [path.as_uri()]
@@ -103,7 +108,7 @@ def test_live_an_object_that_is_moved_changes_the_reproduction(capsys):
             (lambda: view.show(1), other),
         ):
             change()
-            trajectory = reproduced(model, expected)
+            trajectory = reproduce(model, expected)
             torch.testing.assert_close(view.drawing.trajectory.joints, trajectory.joints)
         start = time.monotonic()
         view.run(0.3)
@@ -141,7 +146,7 @@ def test_live_a_controller_leads_the_robot_to_an_object_that_is_moved_meanwhile(
 
 
 def seen_at(page, camera, point) -> np.ndarray:
-    """The pixel at which a point of the scene is seen, (2,)."""
+    """Find the pixel at which a point of the scene is seen, (2,)."""
     left, top, width, height = page.evaluate(
         "(r => [r.left, r.top, r.width, r.height])"
         "(document.querySelector('canvas').getBoundingClientRect())"
@@ -156,8 +161,8 @@ def seen_at(page, camera, point) -> np.ndarray:
     return np.array((left + width / 2 + across, top + height / 2 - along))
 
 
-def dragged(view, page, before, by):
-    """Whether the object that stands at ``before`` was moved by the mouse, with its arrow."""
+def drag_up(view, page, before, by):
+    """Move the object that stands at ``before`` by the mouse; say whether it followed."""
     page.open(view.url)
     draws(page)
     page.wait_for("document.body.innerText.includes('time [s]')")
@@ -187,7 +192,7 @@ def test_live_an_object_is_dragged_and_the_skill_reproduced_for_it():
         browser.page(800, 700) as page,
     ):
         # a busy browser may lose the capture of the mouse: then the page is opened again
-        assert any(dragged(view, page, before, 0.05 * up) for _ in range(3)), "it did not move"
+        assert any(drag_up(view, page, before, 0.05 * up) for _ in range(3)), "it did not move"
         moved = view.situation.frames["bottle"].position.numpy() - before
         np.testing.assert_allclose(moved, 0.05 * up, atol=0.005)
         local = (view.url, view.url.replace("http", "ws"), "data:", "blob:")

@@ -2,7 +2,6 @@
 
 import copy
 import re
-import sys
 from collections import defaultdict
 from dataclasses import replace
 
@@ -14,7 +13,6 @@ from tests.support.worlds import upper_body
 from tpgmm_tools.viewing import parse_shape, write_rerun
 from tpgmm_tools.viewing.curves import motion_marks, motion_panels
 from tpgmm_torch import Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DependencyError
 
 
 class Marked(TaskParameterizedGMM):
@@ -33,7 +31,7 @@ def with_an_event():
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def chunks(tmp_path_factory):
     """Columns by entity, (instants, values) where there is a time line; and the trajectory."""
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
@@ -55,8 +53,8 @@ def recorded(tmp_path_factory):
     return found, trajectory
 
 
-def test_links_are_where_the_joints_put_them(recorded):
-    found, trajectory = recorded
+def test_links_are_where_the_joints_put_them(chunks):
+    found, trajectory = chunks
     moved = found["/robot/l_hand"]
     hand = upper_body().state(trajectory.joints).position("l_hand")
     instants = (trajectory.time - trajectory.time[0]).numpy()
@@ -66,8 +64,8 @@ def test_links_are_where_the_joints_put_them(recorded):
         np.testing.assert_allclose(position, hand[step], atol=2e-5)
 
 
-def test_events_are_logged_when_they_are(recorded):
-    found, trajectory = recorded
+def test_events_are_logged_when_they_are(chunks):
+    found, trajectory = chunks
     expected = [(m.time, m.label) for m in motion_marks(with_an_event(), trajectory)]
     logged = [
         (pytest.approx(now.total_seconds(), abs=1e-6), text)
@@ -77,23 +75,13 @@ def test_events_are_logged_when_they_are(recorded):
     assert expected == logged
 
 
-def test_paths_objects_and_uncertainty_are_there(recorded):
-    found, _ = recorded
+def test_paths_objects_uncertainty_and_curves_are_those_of_the_page(chunks):
+    found, trajectory = chunks
     assert len(found["/reproduction/l_hand"]["static LineStrips3D:strips"][0]) >= 200
     assert found["/frames/bottle/shape"]["static Cylinders3D:lengths"] == [[pytest.approx(0.2)]]
     assert found["/covariance/r_hand"]["static Ellipsoids3D:half_sizes"]
     assert found["/demonstrations/l_hand"]
-
-
-def test_the_curves_are_those_of_the_page(recorded):
-    found, trajectory = recorded
     *_, shares = motion_panels(skills.small_bottle(), trajectory)
     [entity] = [name for name in found if re.fullmatch("/curves/.*/joints", name)]
     values = [value for _, [value] in found[entity]["Scalars:scalars"]]
     np.testing.assert_allclose(values, shares.curves[-1].values, rtol=1e-6)
-
-
-def test_without_rerun_the_error_names_the_extra(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[rerun\]"):
-        write_rerun(tmp_path / "m.rrd", skills.hands(), skills.new_handling()[0])

@@ -20,14 +20,14 @@ from tpgmm_torch.robots.urdf import read_urdf
 
 @pytest.fixture(scope="module")
 def bottle():
-    """The paper's skill at two pictures per second, and the demonstrations in it."""
+    """Draw the paper's skill at two pictures per second, and the demonstrations in it."""
     shown = skills.few_bottles()
     scene = MotionScene(skills.small_bottle(), shown, fps=2.0)
     return scene.draw(Situation.of(shown[1])), shown
 
 
-def shown_at(drawing):
-    """Time steps of the pictures."""
+def steps_of(drawing):
+    """Find the time steps of the pictures."""
     time = drawing.trajectory.time
     return torch.searchsorted(time, torch.from_numpy(drawing.time) + time[0] - 1e-9)
 
@@ -36,7 +36,7 @@ def test_every_link_of_the_robot_is_where_its_joints_put_it(bottle):
     drawing, _ = bottle
     links = read_urdf(upper_body().config()["urdf"]).links
     whole = Robot.from_urdf(upper_body().config()["urdf"], links)
-    state = whole.state(drawing.trajectory.joints[shown_at(drawing)])
+    state = whole.state(drawing.trajectory.joints[steps_of(drawing)])
     for link in links:
         expected = torch.cat((state.position(link), state.orientation(link)), -1)
         poses = drawing.nodes[f"/robot/{link}"].poses
@@ -97,7 +97,7 @@ def test_what_is_held_goes_with_the_hand_and_stays_where_it_is_put(recorded):
         frames = {"bottle": Frame(bottle.position + away, bottle.orientation)}
         situation = replace(situation, frames=frames)
     drawing = MotionScene(model, fps=5).draw(situation)
-    state = upper_body().state(drawing.trajectory.joints[shown_at(drawing)])
+    state = upper_body().state(drawing.trajectory.joints[steps_of(drawing)])
     hand = Frame(state.position("l_hand"), state.orientation("l_hand"))
     poses = torch.from_numpy(drawing.nodes["/frames/bottle"].poses)
     bottle, at = Frame(poses[:, :3], poses[:, 3:]), drawing.picture

@@ -84,14 +84,11 @@ def test_a_link_that_cannot_be_drawn_becomes_sticks_to_its_joints(visuals):
 def test_a_mesh_is_looked_for_by_the_end_of_its_name(tmp_path, place):
     file = tmp_path / place / "arm.stl"
     file.parent.mkdir(parents=True, exist_ok=True)
+    with pytest.raises(DataError, match=r"mesh 'package://.*' of link 'arm' is not in the"):
+        shapes(robot(MESH), tmp_path)
     file.write_text("")
     [found] = shapes(robot(MESH), tmp_path)["arm"]
     assert (found.kind, found.size, found.file) == ("mesh", (2.0, 2.0, 3.0), file)
-
-
-def test_a_mesh_that_is_not_in_the_folder_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"mesh 'package://.*' of link 'arm' is not in the"):
-        shapes(robot(MESH), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -137,11 +134,6 @@ def test_of_a_body_only_what_the_base_holds_is_drawn():
 def test_a_shape_that_is_none_is_refused(text):
     with pytest.raises(DataError, match="a shape is box:X,Y,Z"):
         parse_shape(text)
-
-
-def test_a_shape_is_read_from_text():
-    box = parse_shape("box:0.1,0.2,3")
-    assert (box.kind, box.size) == ("box", (0.1, 0.2, 3.0))
 
 
 #: A triangle in millimetres, 100 of them up.

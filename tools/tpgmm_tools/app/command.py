@@ -53,18 +53,17 @@ def page(
     import torch
 
     from tpgmm_tools.app.page import page as built
-    from tpgmm_torch.exceptions import DataError
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
     kinematics = described.read()
     if dataset is None and kinematics is not None:
-        raise DataError("--robot describes DATASET, and none is given")
+        raise options.refuse("--robot describes DATASET, and none is given")
 
-    def recorded() -> Recorded:
+    def read_recorded() -> Recorded:
         return data.read(str(dataset), kinematics), kinematics
 
-    blocks = built({} if dataset is None else {dataset: recorded})
+    blocks = built({} if dataset is None else {dataset: read_recorded})
     from gradio.themes import Default
 
     _, url, _ = blocks.launch(

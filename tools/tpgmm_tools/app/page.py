@@ -18,7 +18,7 @@ import numpy as np
 from tpgmm_datasets.checks.check import check
 from tpgmm_datasets.robots import ROBOTS
 from tpgmm_datasets.tables import trajectories_to_frame, write_table
-from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
+from tpgmm_tools.app.sources import Recorded, generate_bottle, read_uploads
 from tpgmm_tools.arguments.options import RobotOptions, align
 from tpgmm_tools.cli.application import explain
 from tpgmm_tools.viewing import write_motion
@@ -26,12 +26,15 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import save
+from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.choices import prepared
 
-__all__ = ["GENERATED", "UPLOADED", "Skill", "learn", "moved", "page", "places_of", "show"]
+__all__ = [
+    "GENERATED", "UPLOADED", "Skill", "learn", "move_objects", "page", "places_of", "show",
+]  # fmt: skip
 
 GENERATED, UPLOADED = "generated: shaking a bottle with two hands", "my files"
 #: Of the choice of robots: joints alone, a file that is sent along.
@@ -61,7 +64,7 @@ class Skill:
 
 
 @contextmanager
-def _remarks() -> Iterator[list[str]]:
+def _collect_remarks() -> Iterator[list[str]]:
     """Collect the texts of warnings, each once, as lines of Markdown."""
     lines: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
@@ -72,8 +75,8 @@ def _remarks() -> Iterator[list[str]]:
     lines += ["\n**To be looked at:**", *(f"- {text}" for text in texts)] if texts else []
 
 
-def _refusal(error: Exception) -> str:
-    """The message of an error as Markdown; an error that no user can mend is raised."""
+def _refuse(error: Exception) -> str:
+    """Write the message of an error as Markdown; raise one that no user can mend."""
     message = explain(error)
     if message is None:
         raise error
@@ -101,7 +104,7 @@ def learn(
     robot, robot_file : str
         One of ``ROBOTS``, "none", or ``ROBOT_FILE`` if the file describes it.
     links, frames : str
-        Separated by commas; see :func:`tpgmm_tools.app.sources.uploaded`.
+        Separated by commas; see :func:`tpgmm_tools.app.sources.read_uploads`.
     n_components : float
         K, the number of Gaussians.
     more : mapping of str to callable, optional
@@ -115,25 +118,18 @@ def learn(
         What was learned, or why not, as Markdown.
     """
     try:
-        with _remarks() as remarks:
+        with _collect_remarks() as remarks:
             if source == UPLOADED:
-                described = robot_file if robot == ROBOT_FILE else robot
-                given = None if described == NO_ROBOT else described
-                kinematics = RobotOptions([given] if given else None, _names(links)).read()
-                read = uploaded(files or (), kinematics, _names(frames))
+                described = {ROBOT_FILE: robot_file, NO_ROBOT: None}.get(robot, robot)
+                given = None if described is None else [described]
+                kinematics = RobotOptions(given, _names(links)).read()
+                read = read_uploads(files or (), kinematics, _names(frames))
             else:
-                known: dict[str, Callable[[], Recorded]] = {GENERATED: generated_bottle}
+                known: dict[str, Callable[[], Recorded]] = {GENERATED: generate_bottle}
                 read, kinematics = (known | dict(more or {}))[source]()
-            check(read, kinematics).act()
-            hands = kinematics.links if kinematics is not None else ()
-            operators = default_operators(hands, list(read[0].frames))
-            model = TaskParameterizedGMM(
-                int(n_components), operators, kinematics, random_state=0
-            )
-            aligned = align(read, "dtw", kinematics)
-            model.fit(prepared(aligned, operators, kinematics))
+            model = _fit(read, kinematics, int(n_components))
     except Exception as error:
-        return None, _refusal(error)
+        return None, _refuse(error)
     seconds = [one.duration for one in read]
     lines = [
         f"Learned {len(read)} demonstrations of {min(seconds):.1f} to {max(seconds):.1f} s.",
@@ -142,8 +138,17 @@ def learn(
     return Skill(model, read), "\n".join(lines + remarks)
 
 
+def _fit(
+    read: list[Demonstration], robot: Kinematics | None, n_components: int
+) -> TaskParameterizedGMM:
+    check(read, robot).act()
+    operators = default_operators(() if robot is None else robot.links, list(read[0].frames))
+    model = TaskParameterizedGMM(n_components, operators, robot, random_state=0)
+    return model.fit(prepared(align(read, "dtw", robot), operators, robot))
+
+
 def places_of(skill: Skill | None, number: int) -> list[list[Any]]:
-    """Rows of the table of objects that stand still in a demonstration, to be changed.
+    """Return rows of a table of the objects that stand still in a demonstration.
 
     Parameters
     ----------
@@ -158,8 +163,8 @@ def places_of(skill: Skill | None, number: int) -> list[list[Any]]:
     ]
 
 
-def moved(situation: Situation, places: Sequence[Sequence[Any]]) -> Situation:
-    """The situation with objects elsewhere.
+def move_objects(situation: Situation, places: Sequence[Sequence[Any]]) -> Situation:
+    """Return the situation with objects elsewhere.
 
     Parameters
     ----------
@@ -217,13 +222,13 @@ def show(
     folder = Path(_place().name)
     page = folder / "motion.html"
     try:
-        situation = moved(skill.situation(number), places)
-        with _remarks() as remarks:
+        situation = move_objects(skill.situation(number), places)
+        with _collect_remarks() as remarks:
             trajectory = write_motion(
                 page, skill.model, situation, skill.demonstrations, fps=FPS, title="motion"
             )
     except Exception as error:
-        return "", _refusal(error), []
+        return "", _refuse(error), []
     frames = situation.frames_at(trajectory.time)
     write_table(trajectories_to_frame([trajectory], [frames]), folder / "motion.csv")
     save(skill.model, folder / "model")
@@ -246,7 +251,7 @@ def show(
 
 
 def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
-    """The page, not yet served.
+    """Build the page, not yet served.
 
     Parameters
     ----------
@@ -258,18 +263,9 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
     -------
     gradio.Blocks
         ``launch()`` serves it.
-
-    Raises
-    ------
-    DependencyError
-        If gradio is not installed.
     """
-    try:
-        import gradio as gr
-    except ImportError as error:
-        raise DependencyError(
-            "the page needs gradio: pip install 'tpgmm-torch[app]'"
-        ) from error
+    import gradio as gr
+
     sources = [*(more or {}), GENERATED, UPLOADED]
     with gr.Blocks(
         title="tpgmm: a skill from demonstrations",
@@ -327,7 +323,7 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
 
 @cache
 def _place() -> tempfile.TemporaryDirectory[str]:
-    """Where the files of the last picture are; it goes when Python ends."""
+    """Make the folder of the last picture's files; it goes when Python ends."""
     return tempfile.TemporaryDirectory(prefix="tpgmm-")
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Sequence
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from tpgmm_datasets.bottle.skill import BottleShaking, upper_body
 from tpgmm_datasets.reader import load_lerobot
@@ -16,7 +18,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Recorded", "generated_bottle", "uploaded"]
+__all__ = ["Recorded", "generate_bottle", "read_uploads"]
 
 #: Demonstrations, and the robot that gave them if it is known.
 Recorded = tuple[list[Demonstration], Kinematics | None]
@@ -28,15 +30,15 @@ MOST_BYTES = 2 * 1024**3
 
 
 @cache
-def generated_bottle() -> Recorded:
-    """Demonstrations of shaking a bottle with two hands; made once, as that takes a while."""
+def generate_bottle() -> Recorded:
+    """Generate demonstrations of shaking a bottle; once, as that takes a while."""
     return BottleShaking(rate=25).demonstrations(5, 0), upper_body()
 
 
-def uploaded(
+def read_uploads(
     files: Sequence[str | Path], robot: Kinematics | None = None, frames: Sequence[str] = ()
 ) -> list[Demonstration]:
-    """The demonstrations in uploaded files.
+    """Read the demonstrations in uploaded files.
 
     Parameters
     ----------
@@ -55,26 +57,32 @@ def uploaded(
         If these are no such files.
     """
     paths = sorted(path for path in map(Path, files) if not path.name.startswith("."))
-    kinds = {path.suffix.lower() for path in paths}
-    if kinds == {".zip"} and len(paths) == 1:
-        with TemporaryDirectory() as place:
-            folder = _unpacked(paths[0], Path(place))
-            sources = parse_frames(frames) or {}
-            for one in map(str, sources.values()):
-                if one.endswith((".csv", ".parquet")):
-                    raise DataError(f"{one} is not in the set: tpgmm dataset add-frames")
-            return load_lerobot(folder, robot=robot, frames=sources or None)
-    if not paths or not kinds <= {".csv", ".parquet"}:
+    suffixes = [path.suffix.lower() for path in paths]
+    if suffixes == [".zip"]:
+        return _read_archive(paths[0], robot, parse_frames(frames) or {})
+    if not paths or not {*suffixes} <= {".csv", ".parquet"}:
         names = ", ".join(path.name for path in paths) or "no file"
         raise DataError(
             "give one .zip of a LeRobot data set's folder, or tables (.csv, .parquet); got "
             f"{names}"
         )
-    return [one for path in paths for one in demonstrations_from_frame(read_table(path))]
+    tables = map(demonstrations_from_frame, map(read_table, paths))
+    return list(chain.from_iterable(tables))
 
 
-def _unpacked(archive: Path, place: Path) -> Path:
-    """The folder of the one data set in a zip archive."""
+def _read_archive(
+    archive: Path, robot: Kinematics | None, frames: dict[str, Any]
+) -> list[Demonstration]:
+    with TemporaryDirectory() as place:
+        folder = _unpack(archive, Path(place))
+        for one in map(str, frames.values()):
+            if one.endswith((".csv", ".parquet")):
+                raise DataError(f"{one} is not in the set: tpgmm dataset add-frames")
+        return load_lerobot(folder, robot=robot, frames=frames or None)
+
+
+def _unpack(archive: Path, place: Path) -> Path:
+    """Unpack a zip archive, and return the folder of the one data set in it."""
     try:
         with zipfile.ZipFile(archive) as opened:
             size = sum(entry.file_size for entry in opened.infolist())

@@ -40,7 +40,7 @@ class Help:
     basic: Collection[str]
 
     def lines(self, path: str, every: bool) -> Iterator[str]:
-        """The lines of the help.
+        """Write the lines of the help.
 
         Parameters
         ----------
@@ -49,30 +49,42 @@ class Help:
         every : bool
             Whether to list all parameters, in groups, with all that is known of them.
         """
-        needed = [_syntax(one) for one in self.parameters if _is_required(one)]
+        needed = [_write_syntax(one) for one in self.parameters if _is_required(one)]
         yield from textwrap.wrap(f"Usage: {path} {' '.join(needed)} [OPTIONS]", WIDTH)
         paragraphs = self.text.strip().split("\n\n")
         for paragraph in paragraphs if every else paragraphs[:1]:
             yield ""
             yield from textwrap.wrap(paragraph, WIDTH)
+        yield from self._parameter_lines(every)
+        if not every:
+            rest = sum(not self._is_basic(one) for one in self.parameters)
+            yield from [f"{rest} more options: {path} --help-all"] if rest else []
+        yield from self._example_lines(every)
+
+    def _is_basic(self, one: Parameter) -> bool:
+        return _is_required(one) or one.name in self.basic
+
+    def _parameter_lines(self, every: bool) -> Iterator[str]:
+        """Write what is listed, in panels if it is all."""
         panels: dict[str, list[Parameter]] = {}
         for one in self.parameters:
-            if every or _is_required(one) or one.name in self.basic:
+            if every or self._is_basic(one):
                 panel = _info(one).rich_help_panel if every else None
                 panels.setdefault(panel or "", []).append(one)
         for panel, members in panels.items():
             yield ""
             yield from [f"{panel}:"] if panel else []
             for one in members:
-                yield from _entry(_syntax(one), _explained(one, every))
+                yield from _entry(_write_syntax(one), _explain(one, every))
         yield ""
-        if rest := len(self.parameters) - sum(map(len, panels.values())):
-            yield f"{rest} more options: {path} --help-all"
+
+    def _example_lines(self, every: bool) -> Iterator[str]:
+        """Write the examples; a shell goes on behind a backslash."""
         paragraphs = f"Example: {self.example}".split("\n\n")
         for paragraph in paragraphs if every else paragraphs[:1]:
-            command = paragraph.startswith("Example")  # a shell goes on behind a backslash
             lines = textwrap.wrap(paragraph, WIDTH - 2, break_on_hyphens=False)
-            yield from " \\\n  ".join(lines).split("\n") if command else lines
+            is_command = paragraph.startswith("Example")
+            yield from " \\\n  ".join(lines).split("\n") if is_command else lines
 
 
 class Command(TyperCommand):
@@ -109,7 +121,7 @@ HELP_ALL = Parameter(
 
 
 def _info(one: Parameter) -> Any:
-    """Settings of typer about a parameter."""
+    """Return the settings of typer about a parameter."""
     return get_args(one.annotation)[1]
 
 
@@ -117,24 +129,26 @@ def _is_required(one: Parameter) -> bool:
     return one.default is Parameter.empty
 
 
-def _syntax(one: Parameter) -> str:
-    """How a parameter is typed."""
-    kind, info = get_args(one.annotation)[0], _info(one)
-    kinds = {*get_args(kind)} if get_origin(kind) is not Literal else {kind}
-    metavar = info.metavar or ""
-    if get_origin(kind) is Literal:
-        metavar = metavar or "|".join(get_args(kind))
-    elif not metavar and bool not in {kind, *kinds}:
-        numbers = {int: "INTEGER", float: "NUMBER"}
-        metavar = next((numbers[k] for k in (kind, *kinds) if k in numbers), "TEXT")
+def _write_syntax(one: Parameter) -> str:
+    """Write how a parameter is typed."""
+    info = _info(one)
     if isinstance(info, ArgumentInfo):
-        return metavar if info.metavar else one.name.upper()
+        return info.metavar or one.name.upper()
     names = info.param_decls or (info.default,)  # typer keeps the only name as a default
+    metavar = info.metavar or _write_value(get_args(one.annotation)[0])
     return f"{', '.join(names).replace('/', ', ')} {metavar}".strip()
 
 
-def _explained(one: Parameter, every: bool) -> str:
-    """Help of a parameter: all of it, or one sentence."""
+def _write_value(kind: Any) -> str:
+    """Write what stands for a value of a type; nothing for a flag."""
+    if get_origin(kind) is Literal:
+        return "|".join(get_args(kind))
+    kinds = {bool: "", int: "INTEGER", float: "NUMBER"}
+    return next((kinds[k] for k in (kind, *get_args(kind)) if k in kinds), "TEXT")
+
+
+def _explain(one: Parameter, every: bool) -> str:
+    """Explain a parameter: all of its help, or one sentence."""
     text = (_info(one).help or "").replace("\\[", "[")
     if not every:
         text = re.split(r"(?<=[.;:])\s", text)[0].rstrip(".;:") + "."
@@ -146,7 +160,7 @@ def _explained(one: Parameter, every: bool) -> str:
 
 
 def _entry(syntax: str, text: str) -> Iterator[str]:
-    """Lines of one parameter: its syntax, never cut, and what it is for beside it."""
+    """Write the lines of one parameter: its syntax, never cut, and what it is for beside it."""
     lines = textwrap.wrap(text, WIDTH - COLUMN, break_long_words=False) or [""]
     first = f"  {syntax}"
     if len(first) < COLUMN:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import re
 import warnings
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import Parameter, getdoc, signature
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
     from tpgmm_control.obstacles import Scene
     from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
+    from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.robots.kinematics import Kinematics
     from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
-    "Alignments", "DataOptions", "RobotOptions", "align", "command", "look",
-    "options_of", "scene", "wanted",
+    "Alignments", "DataOptions", "RobotOptions", "SceneOptions", "align", "command",
+    "load_one_thread", "read_situations", "refuse", "show_progress",
 ]  # fmt: skip
 
 #: Options that most people need: a command's ``--help`` lists those of them that it has.
@@ -85,7 +87,7 @@ class DataOptions:
     relax: list[str] | None = None
 
     def arguments(self, robot: Kinematics | None = None) -> dict[str, Any]:
-        """Keyword arguments of :func:`tpgmm_datasets.load_lerobot`, ``robot`` among them.
+        """Return the arguments of :func:`tpgmm_datasets.load_lerobot`, with the ``robot``.
 
         Raises
         ------
@@ -106,14 +108,14 @@ class DataOptions:
             "relax": self.relax or (),
         }
 
-    def opened(self, dataset: str, robot: Kinematics | None, **options: Any) -> Recording:
-        """A ``dataset`` with a robot that has no limits for what is in a unit of its own."""
+    def open(self, dataset: str, robot: Kinematics | None, **options: Any) -> Recording:
+        """Open a ``dataset``, with a robot without limits for what is in a unit of its own."""
         from tpgmm_datasets.reader import open_recording
 
         return open_recording(dataset, **(self.arguments(robot) | options)).unlimited()
 
     def read(self, dataset: str, robot: Kinematics | None = None) -> list[Demonstration]:
-        """The demonstrations in a ``dataset``, joints in the order of a ``robot``."""
+        """Read the demonstrations in a ``dataset``, joints in the order of a ``robot``."""
         from tpgmm_datasets.reader import load_lerobot
 
         return load_lerobot(dataset, **self.arguments(robot))
@@ -146,7 +148,7 @@ class RobotOptions:
     poses: list[str] | None = None
 
     def read(self) -> Kinematics | None:
-        """The robot, or tracked poses; None for joints alone.
+        """Return the robot, or tracked poses; None for joints alone.
 
         Raises
         ------
@@ -154,46 +156,78 @@ class RobotOptions:
             If the options do not go together.
         """
         from tpgmm_datasets.robots import parse_robot
-        from tpgmm_torch.exceptions import DataError
         from tpgmm_torch.robots.tracked_poses import Poses
 
-        parts = self.link or self.robot_joint or self.coordinate
+        parts = any((self.link, self.robot_joint, self.coordinate))
+        if self.poses and (self.robot or parts):
+            raise refuse("--poses are instead of --robot and its links and joints")
         if self.poses:
-            if self.robot or parts:
-                raise DataError("--poses are instead of --robot and its links and joints")
             return Poses(self.poses)
-        if not self.robot:
-            if parts:
-                raise DataError("--link, --robot-joint and --coordinate need --robot FILE")
-            return None
-        chosen = {"joints": self.robot_joint or None, "coordinates": self.coordinate or ()}
-        return parse_robot(self.robot, self.link or (), **chosen)
+        if self.robot:
+            chosen = {"joints": self.robot_joint or None, "coordinates": self.coordinate or ()}
+            return parse_robot(self.robot, self.link or (), **chosen)
+        if parts:
+            raise refuse("--link, --robot-joint and --coordinate need --robot FILE")
+        return None
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Scene.
+
+    Parameters
+    ----------
+    object_ : ``FRAME=SHAPE``
+        What an object looks like, repeatable: box:X,Y,Z, cylinder:RADIUS,LENGTH or
+        sphere:RADIUS in metres, at the origin of its frame; else a small box.
+    meshes : ``FOLDER``
+        The robot's mesh files; without them, sticks stand for meshes.
+    obstacles : ``FILE.xml``
+        An MJCF with what stands around, as for 'tpgmm reproduce': it is drawn. A report lists
+        what touches it, and 'tpgmm view --live' keeps clear of it.
+    visuals : bool
+        With --obstacles, take the robot's visual geometry where it has no collision geometry.
+    """
+
+    object_: list[str] | None = None
+    meshes: Path | None = None
+    obstacles: Path | None = None
+    visuals: bool = False
+
+    def read(self, skill: Skill, shown: list[Demonstration]) -> dict[str, Any]:
+        """Return shapes of objects, the folder of meshes, and obstacles, as views take them."""
+        from tpgmm_tools.viewing import parse_shape
+
+        if self.meshes is not None and not self.meshes.is_dir():
+            raise refuse(f"--meshes needs a folder, got {str(self.meshes)!r}")
+        pairs = [text.partition("=") for text in self.object_ or ()]
+        shapes = {name: parse_shape(shape) for name, _, shape in pairs}
+        around = self.obstacles and read_obstacles(self.obstacles, skill, self.visuals, shown)
+        return {"objects": shapes, "meshes": self.meshes, "obstacles": around}
+
+
+def refuse(message: str) -> Exception:
+    """Return the error of options that cannot be, for ``raise``."""
+    from tpgmm_torch.exceptions import DataError
+
+    return DataError(message)
 
 
 def filter_plausibility(action: str) -> None:
     """Show, make an error of, or ignore what is unlikely about recordings."""
     from tpgmm_torch.exceptions import PlausibilityWarning
 
-    actions: dict[str, Literal["always", "error", "ignore"]] = {
-        "warn": "always",
-        "error": "error",
-        "ignore": "ignore",
-    }
-    warnings.simplefilter(actions[action], PlausibilityWarning)
+    warnings.filterwarnings("always" if action == "warn" else action, "", PlausibilityWarning)  # type: ignore[arg-type]
 
 
 def command(
-    app: typer.Typer,
-    example: str,
-    generated: Iterable[Parameter] = (),
-    *,
-    basic: Collection[str] = BASIC,
+    app: typer.Typer, example: str
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator that adds a function to an app as a command.
+    """Return a decorator that adds a function to an app as a command.
 
     Positional parameters are arguments, others options, explained by the function's docstring.
     A parameter whose type is a group of options (:class:`DataOptions`, ...) stands for all of
-    them, and ``**settings`` for the ``generated`` ones.
+    them.
 
     Parameters
     ----------
@@ -201,21 +235,14 @@ def command(
         Where it is added.
     example : str
         Shown below the help, after "Example: ".
-    generated : iterable of inspect.Parameter
-        As :func:`options_of` makes them.
-    basic : collection of str
-        Parameters that ``--help`` lists, beside those that are required.
     """
 
     def add(function: Callable[..., Any]) -> Callable[..., Any]:
         parameters, groups = list[Parameter](), dict[str, tuple[Any, list[Parameter]]]()
         entries = _entries(function)
         for one in signature(function, eval_str=True).parameters.values():
-            if one.kind is Parameter.VAR_KEYWORD:
-                parameters += generated
-            elif is_dataclass(group := one.annotation) and isinstance(group, type):
-                panel = (group.__doc__ or "").partition(".")[0]
-                groups[one.name] = group, options_of(group, panel)
+            if is_dataclass(one.annotation) and isinstance(one.annotation, type):
+                groups[one.name] = one.annotation, _group_options(one.annotation)
                 parameters += groups[one.name][1]
             else:
                 parameters.append(_option(one, *entries[one.name]))
@@ -229,7 +256,7 @@ def command(
 
         text = (getdoc(function) or "").partition("Parameters\n---")[0]
         run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
-        about = Help(run.__doc__, example, parameters, basic)
+        about = Help(run.__doc__, example, parameters, BASIC)
         parameters = [*parameters, HELP_ALL]
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -239,37 +266,16 @@ def command(
     return add
 
 
-def options_of(made: type, panel: str, without: Collection[str] = ()) -> list[Parameter]:
-    """Options for the parameters of a class, explained by its docstring.
-
-    Of long explanations of a model's parameters the first sentence is shown, and their values
-    are read as :func:`value` does.
-
-    Parameters
-    ----------
-    made : type
-        Its constructor has defaults, its docstring is numpydoc.
-    panel : str
-        Heading of the options in the help.
-    without : collection of str
-        Parameters that get none.
-    """
-    entries, found = _entries(made), list[Parameter]()
-    for one in signature(made, eval_str=is_dataclass(made)).parameters.values():
-        if one.name in without:
-            continue
-        kind, text = entries.get(one.name, ("", ""))
-        one = one.replace(kind=Parameter.KEYWORD_ONLY)
-        if not is_dataclass(made):
-            flag = isinstance(one.default, bool)
-            one = one.replace(annotation=bool if flag else Any)
-            kind, text = "" if flag else "``VALUE``", re.split(r"(?<=\.)\s", text)[0]
-        found.append(_option(one, kind, text, panel))
-    return found
+def _group_options(group: type) -> list[Parameter]:
+    """Return options for the fields of a dataclass; its docstring begins with their heading."""
+    entries, panel = _entries(group), (group.__doc__ or "").partition(".")[0]
+    fields = signature(group, eval_str=True).parameters.values()
+    keyword = Parameter.KEYWORD_ONLY
+    return [_option(one.replace(kind=keyword), *entries[one.name], panel) for one in fields]
 
 
 def _entries(documented: Any) -> dict[str, tuple[str, str]]:
-    """Type and text of each parameter in a numpydoc docstring."""
+    """Return type and text of each parameter in a numpydoc docstring."""
     pattern = r"^([\w, ]+) : (.*)\n((?: .+\n?|\n(?= ))*)"
     found = re.findall(pattern, getdoc(documented) or "", re.MULTILINE)
     return {
@@ -280,7 +286,7 @@ def _entries(documented: Any) -> dict[str, tuple[str, str]]:
 
 
 def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> Parameter:
-    """A parameter with what typer must know: ``X`` in its type is shown as its value."""
+    """Add what typer must know to a parameter: ``X`` in its type is shown as its value."""
     text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text).replace("[", "\\[")
     settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
     if shown := re.search("``(.+)``", kind):
@@ -291,28 +297,49 @@ def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> P
         settings["parser"] = value
     name = one.name.rstrip("_").replace("_", "-")
     negation = f"/--no-{name}" if one.default is True else ""
-    argument = one.kind is not Parameter.KEYWORD_ONLY
-    info = (
-        typer.Argument(**settings)
-        if argument
-        else typer.Option(f"--{name}{negation}", **settings)
-    )
+    if one.kind is Parameter.KEYWORD_ONLY:
+        info = typer.Option(f"--{name}{negation}", **settings)
+    else:
+        info = typer.Argument(**settings)
     annotation: Any = Annotated[one.annotation, info]
     return one.replace(kind=Parameter.KEYWORD_ONLY, annotation=annotation)
 
 
 def value(text: Any) -> Any:
-    """The number that an option's ``text`` is, None for "None"; any other text is itself."""
+    """Return the number that an option's ``text`` is, None for "None", or the text itself."""
     try:
         return ast.literal_eval(text)
     except (SyntaxError, ValueError):
         return text
 
 
-def wanted(
+def load_one_thread(model: Path) -> TaskParameterizedGMM:
+    """Load a fitted ``model`` on the CPU, where one thread computes from now on."""
+    import torch
+
+    from tpgmm_torch.persistence import load_model
+
+    # the matrices are small: a second thread on a busy machine only spins
+    torch.set_num_threads(1)
+    return load_model(model, device="cpu")
+
+
+@contextmanager
+def show_progress(text: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar behind a ``text`` on terminals: the number that is done, and of all."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(text)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def read_situations(
     situations: Path | None, dataset: str | None, data: DataOptions, robot: Kinematics
 ) -> tuple[list[Situation], list[Demonstration]]:
-    """The situations in a file, or else those of a data set; and its demonstrations.
+    """Read the situations in a file, or else those of a data set; and its demonstrations.
 
     Parameters
     ----------
@@ -321,12 +348,12 @@ def wanted(
     data, robot : DataOptions, Kinematics
         Which demonstrations are read, and the order of their joints.
     """
-    from tpgmm_datasets.situation_files import read_situations
+    from tpgmm_datasets import situation_files
     from tpgmm_torch.data.demonstrations import Situation
 
     shown = [] if dataset is None else data.read(dataset, robot)
     if situations is not None:
-        return read_situations(situations, robot.joint_names), shown
+        return situation_files.read_situations(situations, robot.joint_names), shown
     return [Situation.of(one) for one in shown], shown
 
 
@@ -337,49 +364,23 @@ def align(
     from tpgmm_torch.structure.choices import aligner
 
     chosen = aligner(method, robot)
-    if chosen is None:
-        return demonstrations
-    aligned: list[Demonstration] = chosen.fit_transform(demonstrations)
-    return aligned
+    return demonstrations if chosen is None else list(chosen.fit_transform(demonstrations))
 
 
 def check_situation(number: int, count: int) -> None:
     """Refuse a ``number`` of --situation behind the last of ``count`` situations."""
-    from tpgmm_torch.exceptions import DataError
-
     if number >= count:
-        raise DataError(
-            f"there are {count} situations, counted from 0; got --situation {number}"
-        )
+        raise refuse(f"there are {count} situations, counted from 0; got --situation {number}")
 
 
-def look(
-    objects: list[str] | None,
-    meshes: Path | None,
-    obstacles: Path | None,
-    visuals: bool,
-    skill: Skill,
-    shown: list[Demonstration],
-) -> dict[str, Any]:
-    """Shapes of objects, the folder of meshes, and obstacles, as a view draws them."""
-    from tpgmm_tools.viewing import parse_shape
-    from tpgmm_torch.exceptions import DataError
-
-    if meshes is not None and not meshes.is_dir():
-        raise DataError(f"--meshes needs a folder, got {str(meshes)!r}")
-    pairs = [text.partition("=") for text in objects or ()]
-    drawn = {name: parse_shape(shape) for name, _, shape in pairs}
-    around = obstacles and scene(obstacles, skill, visuals, shown)
-    return {"objects": drawn, "meshes": meshes, "obstacles": around}
-
-
-def scene(file: Path, skill: Skill, visuals: bool, shown: list[Demonstration]) -> Scene:
-    """The robot among the obstacles of a ``file``; what is allowed is listed."""
+def read_obstacles(
+    file: Path, skill: Skill, visuals: bool, shown: list[Demonstration]
+) -> Scene:
+    """Put the robot among the obstacles of a ``file``; what is allowed is listed."""
     from tpgmm_control.obstacles import Scene
-    from tpgmm_torch.exceptions import DataError
 
     if not file.is_file():
-        raise DataError(f"--obstacles is an MJCF file, got {str(file)!r}")
+        raise refuse(f"--obstacles is an MJCF file, got {str(file)!r}")
     scene = Scene(skill.kinematics, file, visuals=visuals).allowing(shown).allowing_skill(skill)
     for (one, other), reason in scene.allowed.items():
         typer.echo(f"allowed: {one} and {other} ({reason})")

@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-__all__ = ["COMMANDS", "FORMATS", "load", "model_format", "registered"]
+__all__ = ["COMMANDS", "FORMATS", "find_plugins", "load", "model_format"]
 
 #: Group of commands: a typer app or a function, added under its name.
 COMMANDS = "tpgmm.commands"
@@ -17,24 +17,24 @@ FORMATS = "tpgmm.formats"
 OWN = "tpgmm"
 
 
-def registered(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a ``group`` by name."""
+def find_plugins(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a ``group`` by name."""
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
 def load(plugin: EntryPoint) -> Any:
-    """The object of a ``plugin``.
+    """Load the object of a ``plugin``.
 
     Raises
     ------
     DependencyError
         If it cannot be imported.
     """
-    from tpgmm_torch.exceptions import DependencyError
-
     try:
         return plugin.load()
     except Exception as error:  # whatever is wrong with it
+        from tpgmm_torch.exceptions import DependencyError
+
         raise DependencyError(
             f"{plugin.name!r}, a plugin in {plugin.group!r}, cannot be loaded: "
             f"{type(error).__name__}: {error}"
@@ -42,7 +42,12 @@ def load(plugin: EntryPoint) -> Any:
 
 
 def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
-    """The function that writes a model in the format ``name``; None for a model's own folder.
+    """Return the function that writes a format, None for a model's own folder.
+
+    Parameters
+    ----------
+    name : str
+        Of the format.
 
     Raises
     ------
@@ -55,7 +60,7 @@ def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
 
     if name == OWN:
         return None
-    formats = registered(FORMATS)
+    formats = find_plugins(FORMATS)
     if name not in formats:
         raise DataError(
             f"format {name!r} is not known here; there are {sorted({OWN, *formats})}. "

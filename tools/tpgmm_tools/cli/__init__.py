@@ -1,6 +1,6 @@
 """The command ``tpgmm``.
 
-All modules but ``fit`` import the toolkit inside their commands: ``tpgmm --help`` is quick.
+All modules import the toolkit inside their commands: ``tpgmm COMMAND --help`` is quick.
 """
 
 import sys

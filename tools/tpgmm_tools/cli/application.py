@@ -12,7 +12,18 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tpgmm_tools.arguments import plugins
-from tpgmm_tools.cli import dataset, demo, plot, report, reproduce, sequence, view
+from tpgmm_tools.cli import (
+    calibrate,
+    camera,
+    dataset,
+    demo,
+    fit,
+    plot,
+    report,
+    reproduce,
+    sequence,
+    view,
+)  # fmt: skip
 
 __all__ = ["app", "explain"]
 
@@ -21,25 +32,18 @@ ORDER = (
     "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset",
     "camera", "calibrate",
 )  # fmt: skip
-#: Those that are imported when they run, and their line in ``--help``.
-LATE = {
-    "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
-    "app": EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS),
-    "camera": EntryPoint("camera", "tpgmm_tools.cli.camera:app", plugins.COMMANDS),
-    "calibrate": EntryPoint("calibrate", "tpgmm_tools.cli.calibrate:app", plugins.COMMANDS),
-}
+#: Those above this room, imported when they run; and lines in ``--help`` of such commands.
+LATE = {"app": EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS)}
 HELP = {
-    "fit": "Learn a skill from a LeRobot data set.",
     "app": "Learn and look in the browser: a data set in, a moving picture out.",
-    "camera": "Print tags and boards that cameras find.",
-    "calibrate": "Find lenses and places of cameras, and joint offsets, by the robot's motion.",
     "compare": "Compare policies on simulated tasks.",
 }
 #: How scikit-learn names a parameter; on the command line it is an option.
 PARAMETER = re.compile(r"the '(\w+)' parameter of TaskParameterizedGMM")
 #: Extras by the packages that come with them.
-OPTIONAL = dict.fromkeys(("matplotlib", "pandas", "pyarrow"), "cli")
-OPTIONAL |= dict.fromkeys(("cv2", "av"), "vision")
+OPTIONAL = {
+    "av": "vision", "gradio": "app", "matplotlib": "cli", "pandas": "cli", "pyarrow": "cli",
+}  # fmt: skip
 
 
 class Commands(TyperGroup):
@@ -74,13 +78,13 @@ class Commands(TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The commands of this package and those of plugins."""
-        names = {*super().list_commands(ctx), *_late()}
+        """List the commands of this package and those of plugins."""
+        names = {*super().list_commands(ctx), *_find_late()}
         return sorted(names, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """A command by name; of one that is not imported yet, only the name and one line."""
-        command, late = super().get_command(ctx, cmd_name), _late()
+        """Return a command; of one that is not imported yet, only the name and one line."""
+        command, late = super().get_command(ctx, cmd_name), _find_late()
         if command is None and cmd_name in late:
             origin = late[cmd_name].module.partition(".")[0]
             text = f"A command of {origin}: tpgmm {cmd_name} --help"
@@ -88,20 +92,20 @@ class Commands(TyperGroup):
         return command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is about to run, imported."""
-        if args[0] not in self.commands and args[0] in (late := _late()):
+        """Return the command that is about to run, imported."""
+        if args[0] not in self.commands and args[0] in (late := _find_late()):
             command = typer.main.get_command(plugins.load(late[args[0]]))
             command.name = args[0]
             self.add_command(command)
         return super().resolve_command(ctx, args)
 
 
-def _late() -> dict[str, EntryPoint]:
-    return plugins.registered(plugins.COMMANDS) | LATE
+def _find_late() -> dict[str, EntryPoint]:
+    return plugins.find_plugins(plugins.COMMANDS) | LATE
 
 
 def explain(error: Exception) -> str | None:
-    """The message of an ``error`` that a user can mend; None for any other."""
+    """Return the message of an ``error`` that a user can mend; None for any other."""
     # some releases of typer bring their own copy of click's classes
     if hasattr(error, "format_message"):
         context = getattr(error, "ctx", None)
@@ -115,10 +119,10 @@ def explain(error: Exception) -> str | None:
     from tpgmm_torch.exceptions import PlausibilityWarning, TPGMMError
 
     expected = isinstance(error, TPGMMError | OSError | PlausibilityWarning)
-    return PARAMETER.sub(_option, str(error)) if expected else None
+    return PARAMETER.sub(_write_option, str(error)) if expected else None
 
 
-def _option(match: re.Match[str]) -> str:
+def _write_option(match: re.Match[str]) -> str:
     return f"--{match[1].replace('_', '-')}"
 
 
@@ -136,9 +140,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (demo, plot, report, reproduce, sequence, view):
+for module in (demo, fit, plot, report, reproduce, sequence, view):
     app.registered_commands += module.app.registered_commands
-app.add_typer(dataset.app, name="dataset")
+for module in (calibrate, camera, dataset):
+    app.add_typer(module.app, name=module.__name__.rpartition(".")[2])
 
 
 @app.callback()

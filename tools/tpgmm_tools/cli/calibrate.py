@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.progress import Progress
 
 from tpgmm_tools.arguments import options
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+if TYPE_CHECKING:
+    from tpgmm_datasets.reader import Recording
+    from tpgmm_vision.calibration.cell_calibration import CellCalibration, Mount
+    from tpgmm_vision.cell import CellCamera
 
 __all__ = ["app"]
+
 
 app = typer.Typer(help="Calibrate cameras and cells.", add_completion=False)
 
@@ -62,9 +67,8 @@ def camera(
     entry = camera_content(result.camera, key) | ({"link": link} if link else {})
     content.setdefault("cameras", {})[name] = entry | {"report": str(result)}
     write_cell(content, cell)
-    typer.echo(
-        "\n".join([f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)])
-    )
+    for line in (f"{name}: {result}", *(f"unlikely: {one}" for one in result.problems)):
+        typer.echo(line)
     typer.echo(f"written to {cell}; next: tpgmm calibrate cell SET --cell {cell} --robot ...")
 
 
@@ -116,48 +120,106 @@ def cell(
     out : ``DIR``
         Where pictures with the corners that were seen and expected go.
     """
-    from tpgmm_vision.calibration.cell_calibration import Mount, calibrate_cell
-    from tpgmm_vision.calibration.recorded import slow_postures
-    from tpgmm_vision.cell import pose_content, read_cell, write_cell
-    from tpgmm_vision.detection.tags import Detections, TagDetector
-    from tpgmm_vision.episodes.report import drawn
-    from tpgmm_vision.targets import target_from
+    from tpgmm_vision.calibration.cell_calibration import calibrate_cell
+    from tpgmm_vision.cell import read_cell, write_cell
 
     before = read_cell(cell)
-    known, content = before.cameras, dict(before.content)
-    if unknown := [name for name in camera or () if name not in known]:
-        raise UnknownNameError("camera", unknown[0], "the cell", known)
-    cameras = {name: known[name] for name in camera or known}
-    given = [[_target(one) for one in several or ()] for several in (hand, check)]
-    hands, checks = map(dict, given)
-    names = [name for several in given for name, _ in several]
-    if len({*names}) < len(names):
-        raise DataError(f"--hand and --check name each target once, got {names}")
-    mounts = {
-        name: Mount(target_from(entry, name), name if name in hands else None)
-        for name, entry in {**checks, **hands}.items()
-    }
-    carriers = {one.link for one in cameras.values() if one.link}
-    wanted = carriers.union(hands, described.link or ())
-    robot = replace(described, link=sorted(wanted)).read()
+    cameras = _choose_cameras(before.cameras, camera)
+    mounts, checks = _read_mounts(hand, check)
+    carriers = [one.link for one in cameras.values()] + [one.link for one in mounts.values()]
+    links = {*filter(None, carriers), *(described.link or ())}
+    robot = replace(described, link=sorted(links)).read()
     if robot is None or not cameras or not mounts:
-        raise DataError("a cell is calibrated by its robot (--robot FILE), with cameras in it "
-                        "(tpgmm calibrate camera) and tags in its hand (--hand)")  # fmt: skip
-    if content.get("joints", names := list(robot.joint_names)) != names:
-        raise DataError(f"{cell} is of a robot with joints {content['joints']}, this one has "
-                        f"{names}: give another --cell")  # fmt: skip
+        raise options.refuse(
+            "a cell is calibrated by its robot (--robot FILE), with cameras in it "
+            "(tpgmm calibrate camera) and tags in its hand (--hand)"
+        )
+    content, names = dict(before.content), list(robot.joint_names)
+    if content.get("joints", names) != names:
+        raise options.refuse(
+            f"{cell} is of a robot with joints {content['joints']}, this one has {names}: give "
+            "another --cell"
+        )
     reading = options.DataOptions(units=units, joint_name=joint_name, episodes=episodes)
-    recording = reading.opened(path, robot, frames={})
-    joints, pictures = slow_postures(recording, {n: one.key for n, one in cameras.items()})
-    find, shown = TagDetector(), list[tuple[str, int, Any]]()
-    seen: dict[str, list[Detections]] = {name: [] for name in cameras}
-    with Progress(transient=True) as bar:
-        for k, images in enumerate(bar.track(pictures, len(joints), description="looking")):
-            for name, image in images.items():
-                cameras[name].camera.check(image, name)
-                shown.append((name, k, image))
-                seen[name].append(find(image))
-    result = calibrate_cell(robot, joints, seen, cameras, mounts, bases=base or ())
+    looked = _Pictures(reading.open(path, robot, frames={}), cameras)
+    result = calibrate_cell(
+        robot, looked.joints, looked.seen, cameras, mounts, bases=base or ()
+    )
+    _enter_result(content, result, checks, names)
+    looked.write(out, result)
+    write_cell(content, cell)
+    for line in _report_result(result, ", ".join(cameras), len(looked.joints)):
+        typer.echo(line)
+    next_ = f"pictures in {out}; next: tpgmm dataset track SET OUT --cell {cell}"
+    typer.echo(f"written to {cell}, {next_}")
+
+
+class _Pictures:
+    """Pictures of a hand that stands still, and the tags that are seen in them."""
+
+    def __init__(self, recording: Recording, cameras: Mapping[str, CellCamera]) -> None:
+        from tpgmm_vision.calibration.recorded import slow_postures
+        from tpgmm_vision.detection.tags import TagDetector
+
+        keys = {name: one.key for name, one in cameras.items()}
+        self.joints, pictures = slow_postures(recording, keys)
+        self.images: list[tuple[str, int, Any]] = []
+        self.seen: dict[str, list[Any]] = {name: [] for name in cameras}
+        find = TagDetector()
+        with options.show_progress("looking") as progress:
+            for k, images in enumerate(pictures):
+                for name, image in images.items():
+                    cameras[name].camera.check(image, name)
+                    self.images.append((name, k, image))
+                    self.seen[name].append(find(image))
+                progress(k + 1, len(self.joints))
+
+    def write(self, folder: Path, result: CellCalibration) -> None:
+        """Write the pictures, with the corners that were seen and that were expected."""
+        from tpgmm_vision.episodes.report import drawn
+
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, k, image in self.images:
+            corners, expected = self.seen[name][k].corners, result.expected.get((name, k), {})
+            (folder / f"{name}_{k:03}.jpg").write_bytes(drawn(image, corners, expected))
+
+
+def _choose_cameras(
+    known: Mapping[str, CellCamera], chosen: Sequence[str] | None
+) -> dict[str, CellCamera]:
+    from tpgmm_torch.exceptions import UnknownNameError
+
+    if unknown := [name for name in chosen or () if name not in known]:
+        raise UnknownNameError("camera", unknown[0], "the cell", known)
+    return {name: known[name] for name in chosen or known}
+
+
+def _read_mounts(
+    hand: Sequence[str] | None, check: Sequence[str] | None
+) -> tuple[dict[str, Mount], dict[str, Any]]:
+    """Return the targets of --check and --hand, and the cell file's entries of the former."""
+    from tpgmm_vision.calibration.cell_calibration import Mount
+    from tpgmm_vision.targets import target_from
+
+    checks, hands = (dict(map(_target, texts or ())) for texts in (check, hand))
+    names = [text.partition("=")[0] for text in (*(hand or ()), *(check or ()))]
+    if len({*names}) < len(names):
+        raise options.refuse(f"--hand and --check name each target once, got {names}")
+    mounts = {name: Mount(target_from(entry, name), None) for name, entry in checks.items()}
+    for link, entry in hands.items():
+        mounts[link] = Mount(target_from(entry, link), link)
+    return mounts, checks
+
+
+def _enter_result(
+    content: dict[str, Any],
+    result: CellCalibration,
+    checks: dict[str, Any],
+    joints: Sequence[str],
+) -> None:
+    """Enter what was found into the content of a cell file."""
+    from tpgmm_vision.cell import pose_content
+
     for name, pose in result.cameras.items():
         report = str(result).splitlines()[0]
         content["cameras"][name] |= {"pose": pose_content(pose), "report": report}
@@ -165,30 +227,28 @@ def cell(
         placed = {"target": entry, "pose": pose_content(result.mounts[name])}
         content.setdefault("checks", {})[name] = placed
     offsets = result.joint_offsets.items()
-    content["joints"] = names
+    content["joints"] = joints
     content["joint_offsets"] = {n: round(v, 6) for n, v in offsets if n not in result.unknown}
-    out.mkdir(parents=True, exist_ok=True)
-    for name, k, image in shown:
-        jpeg = drawn(image, seen[name][k].corners, result.expected.get((name, k), {}))
-        (out / f"{name}_{k:03}.jpg").write_bytes(jpeg)
-    write_cell(content, cell)
-    lines = [f"{', '.join(cameras)}: {len(joints)} postures; {result}"]
-    lines += [f"base of {prefix!r}: moved by {pose_content(pose)} from where --robot has it"
-              for prefix, pose in result.bases.items()]  # fmt: skip
-    lines += [f"unlikely: {problem}" for problem in result.problems]
-    next_ = f"pictures in {out}; next: tpgmm dataset track SET OUT --cell {cell}"
-    typer.echo("\n".join([*lines, f"written to {cell}, {next_}"]))
+
+
+def _report_result(result: CellCalibration, cameras: str, postures: int) -> Iterator[str]:
+    from tpgmm_vision.cell import pose_content
+
+    yield f"{cameras}: {postures} postures; {result}"
+    for prefix, pose in result.bases.items():
+        yield f"base of {prefix!r}: moved by {pose_content(pose)} from where --robot has it"
+    yield from (f"unlikely: {problem}" for problem in result.problems)
 
 
 def _target(text: str) -> tuple[str, dict[str, Any]]:
-    """The name of a target that an option describes, and what a cell file says of it."""
+    """Return the name of a target that an option describes, and its entry in a cell file."""
     name, _, described = text.partition("=")
     try:
         kind, numbers, size = described.split(":")
         several = [int(number) for number in numbers.split(",")]
         return name, {kind: {"cube": several, "tag": several[0]}[kind], "size": float(size)}
     except (ValueError, KeyError) as error:
-        raise DataError(
+        raise options.refuse(
             f"tags are described as NAME=cube:10,11,12,13,14:0.03 or NAME=tag:3:0.04 (numbers, "
             f"and the edge in metres), got {text!r}"
         ) from error

@@ -9,9 +9,6 @@ from typing import Literal
 import typer
 
 from tpgmm_tools.arguments import options
-from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.printing import print_targets
-from tpgmm_vision.targets import DEFAULT_FAMILY, Board
 
 __all__ = ["app"]
 
@@ -26,7 +23,7 @@ def print(
     cube: list[str] | None = None,
     board: bool = False,
     size: float = 40.0,
-    family: str = DEFAULT_FAMILY,
+    family: str = "apriltag_36h11",
     page: Literal["a4", "letter"] = "a4",
     out: Path = Path("targets.pdf"),
 ) -> None:
@@ -53,10 +50,13 @@ def print(
     out : ``FILE.pdf``
         Where it goes.
     """
+    from tpgmm_vision.printing import print_targets
+    from tpgmm_vision.targets import Board
+
     try:
         cubes = [[int(number) for number in one.split(",")] for one in cube or ()]
     except ValueError as error:
-        raise DataError(f"--cube has numbers, as 10,11,12,13,14, got {cube}") from error
+        raise options.refuse(f"--cube has numbers, as 10,11,12,13,14, got {cube}") from error
     style, drawn = {"family": family, "page": page}, Board() if board else None
     entries = print_targets(out, tag or (), cubes, drawn, size=size / 1e3, **style)
     typer.echo(f"{out}: print it at 100 %, and measure the ruler")

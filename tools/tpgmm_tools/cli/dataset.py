@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import chain, repeat, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from tpgmm_tools.arguments import options
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo
     from tpgmm_datasets.lerobot.layout import Episode
+    from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
@@ -44,9 +46,9 @@ def info(
     description = describe_lerobot(path)
     for name, value in _summary(description).items():
         typer.echo(f"{name:<10} {value}")
-    rows = [("column", "type", "value", "unit", "from", "to")]
-    rows += [row for column in description.columns for row in _rows(column)]
-    typer.echo(f"\n{in_columns(rows)}")
+    head = ("column", "type", "value", "unit", "from", "to")
+    rows = [row for column in description.columns for row in _rows(column)]
+    typer.echo(f"\n{in_columns([head, *rows])}")
     for problem in summed_up(description.problems):
         typer.echo(f"problem: {problem}")
 
@@ -72,13 +74,7 @@ def check(
         Fail for what is only unlikely, too.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import (
-        CHECKS,
-        DatasetError,
-        DatasetWarning,
-        UnknownUnitsError,
-        summed_up,
-    )
+    from tpgmm_datasets.errors import CHECKS, summed_up
 
     description = describe_lerobot(path)
     problems = [problem for problem in description.problems if problem.check != "joints"]
@@ -87,12 +83,23 @@ def check(
     if problems:
         raise typer.Exit(1)
     # all problems in one go, not the first
-    recording = data.opened(path, described.read(), relax=CHECKS)
+    recording = data.open(path, described.read(), relax=CHECKS)
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
     if description.tracked:
-        typer.echo(f"tracked: {_tracked(description)}")
+        typer.echo(f"tracked: {_sum_up_tracking(description)}")
+    findings = _check_plausibility(recording, strict)
+    for kind, finding in findings:
+        typer.echo(f"{kind}: {finding}")
+    if any(strict or kind == "error" for kind, _ in findings):
+        raise typer.Exit(1)
+
+
+def _check_plausibility(recording: Recording, strict: bool) -> list[tuple[str, object]]:
+    """Return errors, and what is unlikely; exit where units are not known."""
+    from tpgmm_datasets.errors import DatasetError, DatasetWarning, UnknownUnitsError
+
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
@@ -101,15 +108,10 @@ def check(
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
     except DatasetError as error:
-        typer.echo(f"error: {error}")
-        raise typer.Exit(1) from error
-    bad = [str(one.message) for one in caught if issubclass(one.category, DatasetWarning)]
-    for problem in bad:
-        typer.echo(f"error: {problem}")
-    for finding in report:
-        typer.echo(f"{'error' if finding.impossible else 'unlikely'}: {finding}")
-    if bad or report.errors() or (strict and len(report)):
-        raise typer.Exit(1)
+        return [("error", error)]
+    bad = [one.message for one in caught if issubclass(one.category, DatasetWarning)]
+    found = [("error" if one.impossible else "unlikely", one) for one in report]
+    return [*(("error", message) for message in bad), *found]
 
 
 @options.command(app, "tpgmm dataset plot out/demo/dataset --out out/dataset.png")
@@ -128,7 +130,7 @@ def plot(
     out : ``FILE.png``
         Where the picture goes.
     """
-    import numpy as np
+    import torch
 
     from tpgmm_tools.plotting import figure, save
 
@@ -137,15 +139,11 @@ def plot(
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
     panels += [f"{name}.{axis}" for name in first.frames for axis in "xyz"]
     drawing = figure(len(panels), f"{path}: {len(demonstrations)} episodes", height=0.9)
-    for demonstration in demonstrations:
-        time = demonstration.time.numpy()
-        poses = [
-            np.broadcast_to(pose.position.numpy(), (len(time), 3))
-            for pose in demonstration.frames.values()
-        ]
-        values = np.concatenate([demonstration.joints.numpy(), *poses], axis=1)
+    for one in demonstrations:
+        frames = [frame.expand(one.time.shape).position for frame in one.frames.values()]
+        values = torch.cat([one.joints, *frames], dim=1)
         for axes, column in zip(drawing.axes, values.T, strict=True):
-            axes.plot(time, column, linewidth=0.8, alpha=0.7)
+            axes.plot(one.time, column, linewidth=0.8, alpha=0.7)
     for axes, name in zip(drawing.axes, panels, strict=True):
         axes.set_ylabel(name, fontsize="x-small", rotation=0, ha="right")
         axes.tick_params(labelsize="x-small")
@@ -186,8 +184,8 @@ def generate(
     if path.exists() and not append:  # the writer would say so too, ten seconds later
         raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
     skill = BottleShaking(rate=rate, steady_rhythm=steady_rhythm)
-    demonstrations = skill.demonstrations(n_demonstrations, random_state)
-    _save(demonstrations, path, append, fps=rate, task=TASK, robot_type="upper_body")
+    shown = skill.demonstrations(n_demonstrations, random_state)
+    _save(shown, path, append, fps=rate, task=TASK, robot_type="upper_body")
 
 
 @options.command(app, CONVERT)
@@ -217,24 +215,19 @@ def convert(
     task : str
         What is done, for all. Default: each episode's own.
     """
-    recording = data.opened(source, described.read())
+    recording = data.open(source, described.read())
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints
     kept = demonstrations[0].joint_names or ()
     stored = {"m": "m", "mm": "m", "raw": "raw"}  # what is no angle once it is read
-    _save(
-        demonstrations,
-        path,
-        append,
-        fps=data.rate or layout.fps,
-        task=[task] * len(demonstrations) if task else _tasks(recording.episodes),
-        robot_type=layout.robot_type,
-        units={
-            name: stored[unit]
-            for name, unit in zip(columns.names or (), columns.units, strict=False)
-            if name in kept and unit in stored
-        },
-    )
+    units = {
+        name: stored[unit]
+        for name, unit in zip(columns.names or (), columns.units, strict=False)
+        if name in kept and unit in stored
+    }
+    tasks = [task] * len(demonstrations) if task else _tasks(recording.episodes)
+    about = {"task": tasks, "robot_type": layout.robot_type, "units": units}
+    _save(demonstrations, path, append, fps=data.rate or layout.fps, **about)
 
 
 @options.command(
@@ -297,8 +290,6 @@ def track(
     joint_name : ``STORED=JOINT``
         The robot's name of a stored joint, as of 'tpgmm fit', repeatable.
     """
-    from rich.progress import Progress
-
     from tpgmm_torch.checks.report import in_columns
     from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_vision.episodes.report import table
@@ -309,13 +300,8 @@ def track(
     reading = {
         key: given[key] for key in ("units", "calibration", "joint_names") if key in given
     }
-    with Progress() as bar:
-        task = bar.add_task("tracking")
-
-        def advance(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        reports = track_lerobot(path, out, cell, robot, **reading, progress=advance)
+    with options.show_progress("tracking") as progress:
+        reports = track_lerobot(path, out, cell, robot, **reading, progress=progress)
     typer.echo(in_columns(table(reports)))
     known = {str(one.index): [t.known.mean() for t in one.tracks.values()] for one in reports}
     if unknown := [index for index, shares in known.items() if min(shares) < 0.95]:
@@ -329,12 +315,10 @@ def track(
 
 
 def _tasks(episodes: Sequence[Episode]) -> list[str]:
-    """The task of each episode, of which it must have one."""
-    from tpgmm_torch.exceptions import DataError
-
+    """Return the task of each episode, which must have one."""
     for episode in episodes:
         if len(episode.tasks) != 1:
-            raise DataError(
+            raise options.refuse(
                 f"episode {episode.index} has {len(episode.tasks)} tasks, not one: give --task"
             )
     return [episode.tasks[0] for episode in episodes]
@@ -364,27 +348,23 @@ def _summary(description: DatasetInfo) -> dict[str, object]:
         "joints": description.joints or "not found",
         "frames": ", ".join(description.frames) or "none found",
         "events": ", ".join(description.events) or "none found",
-        "tracked": _tracked(description),
+        "tracked": _sum_up_tracking(description),
         "problems": len(description.problems) or "none",
     }
 
 
-def _tracked(description: DatasetInfo) -> str:
-    """How often objects were seen in the pictures."""
+def _sum_up_tracking(description: DatasetInfo) -> str:
+    """Say how often objects were seen in the pictures."""
     shares = description.tracked.items()
     found = [f"{name} seen in {a:.0%}, known in {b:.0%} of all rows" for name, (a, b) in shares]
     return ", ".join(found) or "none"
 
 
-def _rows(column: ColumnInfo) -> Iterator[tuple[str, str, str, str, str, str]]:
-    """A row per value; the key stands in the first."""
+def _rows(column: ColumnInfo) -> Iterator[tuple[str, ...]]:
+    """Make a row for each value; the key stands in the first."""
     width = len(column.low or column.names or column.units or (0,))
-    for i in range(width):
-        yield (
-            column.key if i == 0 else "",
-            column.dtype if i == 0 else "",
-            column.names[i] if column.names else str(i),
-            column.units[i] if column.units else "",
-            f"{column.low[i]:.4g}" if column.low else "",
-            f"{column.high[i]:.4g}" if column.high else "",
-        )
+    names = column.names or map(str, range(width))
+    low, high = ([f"{x:.4g}" for x in ends or ()] for ends in (column.low, column.high))
+    keys = chain([(column.key, column.dtype)], repeat(("", "")))
+    rows = zip_longest(names, column.units or (), low, high, fillvalue="")
+    yield from ((*key, *values) for key, values in zip(keys, rows, strict=False))

@@ -111,7 +111,7 @@ def demo(
 
 
 def table(rows: Mapping[str, Mapping[str, Any]]) -> Table:
-    """The metrics as a table of at most 80 columns.
+    """Write the metrics as a table of at most 80 columns.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def _cell(value: Any, parts: tuple[str, ...], digits: int) -> str:
 
 
 def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences about the numbers of the demo.
+    """Say the numbers of the demo in sentences.
 
     Parameters
     ----------

@@ -2,41 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import typer
 
-from tpgmm_datasets.conversion.poses import LinkPose
-from tpgmm_datasets.episode_batches import EpisodeBatches
-from tpgmm_datasets.lerobot.columns import EVENT
-from tpgmm_datasets.lerobot.event_flags import event_features
-from tpgmm_datasets.reader import Recording
-from tpgmm_datasets.signals import Signals
-from tpgmm_datasets.units import Scale
 from tpgmm_tools.arguments import options
 from tpgmm_tools.arguments.plugins import OWN, model_format
-from tpgmm_torch.constraints import check_parameters
-from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.mixture.processes import joined_processes
-from tpgmm_torch.operators.text import format_operator, parse_operator
-from tpgmm_torch.persistence import save
-from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
-from tpgmm_torch.structure.choices import (
-    Choices,
-    aligner,
-    learn,
-    operators_or_default,
-    parse_parts,
-    prepared,
-)  # fmt: skip
-from tpgmm_torch.training.hold_detection import with_holds
 
-__all__ = ["app"]
+if TYPE_CHECKING:
+    from tpgmm_datasets.reader import Recording
+    from tpgmm_datasets.units import Scale
+    from tpgmm_torch.data.demonstrations import Demonstration
+    from tpgmm_torch.data.holds import Hold
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.operators import Operator
+    from tpgmm_torch.robots.kinematics import Kinematics
+    from tpgmm_torch.structure.choices import Choices
+
+__all__ = ["ModelOptions", "app"]
 
 app = typer.Typer()
 
@@ -44,34 +31,111 @@ EXAMPLE = (
     "tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand --frame bottle "
     "--n-components 30 --out out/model"
 )
-#: Parameters of the model that have an option below, or none.
-OTHERS = (
-    "n_components", "operators", "robot", "fusion", "random_state",
-)  # fmt: skip
-SETTINGS = options.options_of(TaskParameterizedGMM, "Learning", OTHERS)
+#: Fields of :class:`ModelOptions` that are no parameters of the model.
+CHOSEN = ("parts", "modes", "epsilon")
 
 
-@options.command(app, EXAMPLE, SETTINGS)
+@dataclass(frozen=True)
+class ModelOptions:
+    """Learning.
+
+    Parameters
+    ----------
+    n_components : ``auto | INTEGER``
+        K, the number of Gaussians; 'auto' finds it by the likelihood of episodes that are left
+        out.
+    parts : ``auto | 4.2,8.1 | grasp,rest``
+        Where the skill has parts that are learned one by one, each with its share of
+        --n-components and, with --operator auto, what matters in it: 'auto' finds and explains
+        them; or when they end, as seconds and events joined by commas. See --alignment parts.
+    modes : ``auto | INTEGER``
+        In how many ways the skill is done, each a skill of its own; 'auto' finds it. The
+        situation decides which is gone.
+    random_state : int
+        Seed of what is random.
+    fusion : str
+        Form of the product of Gaussians; 'covariance' is the paper's, as printed.
+    epsilon : float >= 0
+        Regulariser of --fusion covariance, rad^2.
+    covariance_type : ``NAME``
+        Shape of the local covariances: full, diag, tied or spherical.
+    reg_covar : float
+        Added to the diagonal of the covariances, relative to the variance of each coordinate.
+    covariance_shrinkage : ``auto | NUMBER``
+        How far the full or tied covariances given time go towards their diagonals after EM,
+        from 0 to 1; slopes over time stay as they are.
+    responsibilities : ``NAME``
+        Of which each point of each demonstration has its own ('point'), or all demonstrations
+        at one instant the same ('instant'): 'auto' takes these where they share one clock.
+    init_params : ``NAME``
+        How EM starts: time (equal bins of the time axis), kmeans or random.
+    n_init : int
+        Number of starts; the most likely result is kept.
+    max_iter : int
+        Largest number of EM iterations.
+    tol : float
+        EM stops when the mean log-likelihood gains less.
+    dtype : ``NAME``
+        float64 or float32.
+    device : str
+        Where tensors live, as torch spells it.
+    """
+
+    n_components: Any = 10
+    parts: str | None = None
+    modes: Any = 1
+    random_state: int = 0
+    fusion: Literal["information", "covariance"] = "information"
+    epsilon: float = 1e-4
+    covariance_type: str = "full"
+    reg_covar: float = 1e-5
+    covariance_shrinkage: Any = "auto"
+    responsibilities: str = "auto"
+    init_params: str = "time"
+    n_init: int = 1
+    max_iter: int = 100
+    tol: float = 1e-3
+    dtype: str = "float64"
+    device: str = "cpu"
+
+    def choices(self, operators: bool) -> Choices:
+        """Return what is to be found; with ``operators``, these too."""
+        from tpgmm_torch.structure.choices import Choices, parse_parts
+
+        automatic = self.n_components == "auto"
+        return Choices(operators, automatic, parse_parts(self.parts), self.modes)
+
+    def model(self, operators: Sequence[Any], robot: Kinematics | None) -> TaskParameterizedGMM:
+        """Make the model, not yet fitted."""
+        from tpgmm_torch.constraints import check_parameters
+        from tpgmm_torch.estimator import TaskParameterizedGMM
+        from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
+
+        printed = self.fusion == "covariance"
+        settings = {name: given for name, given in asdict(self).items() if name not in CHOSEN}
+        settings["fusion"] = CovarianceFusion(self.epsilon) if printed else InformationFusion()
+        if self.n_components == "auto":
+            settings["n_components"] = 10
+        model = TaskParameterizedGMM(operators=operators, robot=robot, **settings)
+        check_parameters(model)
+        return model
+
+
+@options.command(app, EXAMPLE)
 def fit(
     dataset: str,
     *,
     out: Path,
     described: options.RobotOptions,
     data: options.DataOptions,
+    settings: ModelOptions,
     format_: str = OWN,
     plausibility: Literal["warn", "error", "ignore"] = "warn",
     alignment: options.Alignments = "dtw",
     batch_episodes: int | None = None,
     operator: list[str] | None = None,
     hold: list[str] | None = None,
-    n_components: Any = 10,
-    parts: str | None = None,
-    modes: Any = 1,
-    random_state: int = 0,
-    fusion: Literal["information", "covariance"] = "information",
-    epsilon: float = 1e-4,
     robust: bool = True,
-    **settings: Any,
 ) -> None:
     """Learn a skill from a LeRobot data set.
 
@@ -110,170 +174,199 @@ def fit(
         When a link holds an object, repeatable: FRAME@LINK:BEGIN-END in seconds, as in
         'bottle@l_hand:4.3-' to the end; or 'none'. Default: found in episodes whose frames were
         recorded over time.
-    n_components : ``auto | INTEGER``
-        K, the number of Gaussians; 'auto' finds it by the likelihood of episodes that are left
-        out.
-    parts : ``auto | 4.2,8.1 | grasp,rest``
-        Where the skill has parts that are learned one by one, each with its share of
-        --n-components and, with --operator auto, what matters in it: 'auto' finds and explains
-        them; or when they end, as seconds and events joined by commas. See --alignment parts.
-    modes : ``auto | INTEGER``
-        In how many ways the skill is done, each a skill of its own; 'auto' finds it. The
-        situation decides which is gone.
-    random_state : int
-        Seed of what is random.
-    fusion : str
-        Form of the product of Gaussians; 'covariance' is the paper's, as printed.
-    epsilon : float >= 0
-        Regulariser of --fusion covariance, rad^2.
     robust : bool
         Leave out episodes that are unlike the others where these agree, with a warning.
     """
+    from tpgmm_datasets.episode_batches import EpisodeBatches
+    from tpgmm_datasets.signals import Signals
+    from tpgmm_torch.mixture.processes import joined_processes
+    from tpgmm_torch.persistence import save
+    from tpgmm_torch.structure import choices as structure
+
     write = model_format(format_)
-    choices = Choices(operator == ["auto"], n_components == "auto", parse_parts(parts), modes)
+    choices = settings.choices(operator == ["auto"])
     choices.check(batch_episodes)
     options.filter_plausibility(plausibility)
-    robot = described.read()
-    given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
-    holds = tuple(given or ()) if hold else None
-    operators = [parse_operator(text) for text in operator or () if text != "auto"]
-    model = TaskParameterizedGMM(
-        10 if choices.components else n_components,
-        operators,
-        robot,
-        fusion=CovarianceFusion(epsilon) if fusion == "covariance" else InformationFusion(),
-        random_state=random_state,
-        **settings,
-    )
-    check_parameters(model)
-    recording = data.opened(dataset, robot)
+    robot, holds = described.read(), _parse_holds(hold)
+    operators = _parse_operators(operator)
+    model = settings.model(operators, robot)
+    recording = data.open(dataset, robot)
     model.robot = robot = recording.assembly.robot
     about = data.arguments(robot)
+    size = batch_episodes
+    batched = None if size is None else partial(EpisodeBatches, dataset, size, **about)
     with joined_processes() as processes:
-        episodes: Any
-        if batch_episodes is None:
-            read = list(recording.demonstrations())
-            first, fitted = options.align(read, alignment, robot), None
-        else:
-            read, first = [], next(iter(EpisodeBatches(dataset, batch_episodes, **about)))
-            fitted = aligner(alignment, robot)
-            fitted = fitted and fitted.fit(first)
-            first = fitted.transform(first) if fitted else first
-        model.operators = operators_or_default(operators, robot, list(first[0].frames))
-        kept = prepared(first, model.operators, robot, robust, holds)
+        read = list(recording.demonstrations()) if batched is None else []
+        first, fitted = _align(read, batched, alignment, robot)
+        frames = list(first[0].frames)
+        model.operators = structure.operators_or_default(operators, robot, frames)
+        kept = structure.prepared(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
-            _echo(_recording_summary(recording, read, kept, described.link, not operator))
-        episodes = processes.share(kept)
-        if batch_episodes is not None:
-            batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **about)
-            episodes = Aligned(batches, fitted, kept[0].holds or ())
-        learned, reports = learn(model, episodes, choices, processes)
+            _echo(_sum_up_episodes(recording, read, kept))
+            _echo(_sum_up_recording(recording, kept, described.link, not operator))
+        episodes: Any = processes.share(kept)
+        if batched is not None:
+            batches = batched(processes=processes)
+            episodes = _Aligned(batches, fitted, kept[0].holds or ())
+        learned, reports = structure.learn(model, episodes, choices, processes)
         if processes.rank > 0:
             return
     if write is None:
         save(learned, out)
     else:
         write(learned, out, Signals.of(dataset, **about))
-    _report(learned, read, kept)
-    for text in reports:
-        typer.echo(f"\n{text}\n")
+    _report(learned, read, kept, reports)
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
     typer.echo(f"next             tpgmm report {out} --dataset {dataset}")
 
 
-class Aligned:
+def _parse_operators(texts: list[str] | None) -> list[Operator]:
+    """Parse the option --operator; empty if they are to be found, or the default."""
+    from tpgmm_torch.operators.text import parse_operator
+
+    return [parse_operator(text) for text in texts or () if text != "auto"]
+
+
+def _parse_holds(texts: list[str] | None) -> tuple[Hold, ...] | None:
+    """Parse the option --hold; None if holds are to be found."""
+    from tpgmm_torch.data.holds import Hold
+
+    if not texts:
+        return None
+    return () if texts == ["none"] else tuple(map(Hold.parse, texts))
+
+
+class _Aligned:
     """Batches of episodes, aligned as they are read.
 
     Parameters
     ----------
-    batches : EpisodeBatches
-        To read.
-    alignment : Alignment, Pipeline or None
-        Fitted to the first of all batches.
-    holds : tuple of Hold
-        Found in that batch.
+    batches, alignment, holds : EpisodeBatches, Alignment or None, tuple of Hold
+        What is read; and how, as the first of all batches decided.
     """
 
-    def __init__(self, batches: EpisodeBatches, alignment: Any, holds: Any) -> None:
+    def __init__(self, batches: Any, alignment: Any, holds: tuple[Hold, ...]) -> None:
         self.batches, self.alignment, self.holds = batches, alignment, holds
 
-    def __iter__(self) -> Iterator[Any]:
-        """Read and align each."""
+    def __iter__(self) -> Iterator[list[Demonstration]]:
+        """Read and align each batch."""
+        from tpgmm_torch.training.hold_detection import with_holds
+
         for batch in self.batches:
             aligned = self.alignment.transform(batch) if self.alignment else batch
             yield with_holds(aligned, self.holds)
 
 
-def _recording_summary(
-    recording: Recording, read: Any, kept: Any, named: list[str] | None, default: bool
-) -> dict[str, object]:
-    """Summary of the data set and the robot, before anything is learned."""
+def _align(
+    read: list[Demonstration], batched: Any, method: str, robot: Kinematics | None
+) -> tuple[list[Demonstration], Any]:
+    """Align all that was read, or else the first batch; and return what aligns the others."""
+    from tpgmm_torch.structure.choices import aligner
+
+    if batched is None:
+        return options.align(read, method, robot), None
+    first, alignment = next(iter(batched())), aligner(method, robot)
+    return alignment.fit(first).transform(first) if alignment else first, alignment
+
+
+def _sum_up_episodes(recording: Recording, read: Any, kept: Any) -> dict[str, str]:
+    """Sum up how many episodes there are; nothing of batches."""
+    if not read:
+        return {}
+    seconds, steps = [one.duration for one in read], sum(map(len, kept))
+    lost = len(recording.episodes) - len(kept) or "none"
+    text = f"{len(read)} of {min(seconds):.2f} to {max(seconds):.2f} s, {steps} steps after"
+    return {"demonstrations": f"{text} alignment; {lost} left out"}
+
+
+def _sum_up_recording(
+    recording: Recording, kept: Any, named: list[str] | None, default: bool
+) -> dict[str, str]:
+    """Sum up the data set and the robot, before anything is learned."""
+    from tpgmm_datasets.lerobot.columns import EVENT
+    from tpgmm_datasets.lerobot.event_flags import event_features
+
     assembly, joints = recording.assembly, recording.assembly.joints
-    names = assembly.robot.joint_names if assembly.robot is not None else joints.names or ()
-    lines: dict[str, object] = {}
-    if read:
-        seconds, steps = [one.duration for one in read], sum(map(len, kept))
-        lost = len(recording.episodes) - len(kept)
-        lines["demonstrations"] = (
-            f"{len(read)} of {min(seconds):.2f} to {max(seconds):.2f} s, {steps} steps after "
-            f"alignment; {lost or 'none'} left out"
-        )
-    lines["joints"] = f"{kept[0].n_joints} of {joints.feature.key}: {', '.join(names)}"
-    units: dict[str, list[str]] = {}
-    for name, unit in zip(joints.names or ("all",), joints.units, strict=False):
-        if name in names or not names:
-            units.setdefault(_unit(unit), []).append(name)
-    lines["units"] = "; ".join(
-        f"{unit}: {', '.join(of)}" if len(units) > 1 else unit for unit, of in units.items()
-    )
-    links = ", ".join(assembly.robot.links) if assembly.robot is not None else ""
-    lines["links"] = links + " (its hands; --link names others)" * bool(links and not named)
-    places = {
-        name: one.at if isinstance(one, LinkPose) else vars(one).get("feature")
-        for name, one in assembly.frames.items()
-    }
-    lines["frames"] = ", ".join(f"{name} ({at or 'given'})" for name, at in places.items())
+    robot = assembly.robot
+    names = joints.names or () if robot is None else robot.joint_names
+    links = "" if robot is None else ", ".join(robot.links)
+    places = (f"{name} ({_place(one)})" for name, one in assembly.frames.items())
     stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]
     found = [f"{name} (looked for)" for name in assembly.events]
-    lines["events"] = ", ".join((*stored, *found))
-    holds = [
-        str(replace(one, begin=round(one.begin, 2), end=round(one.end, 2)))
-        for one in kept[0].holds or ()
-    ]
-    counts = bool(holds) and default and len(kept[0].frames) > 1
-    lines["held"] = ", ".join(holds) + " (put onto an object: --operator auto)" * counts
+    lines = {
+        "joints": f"{kept[0].n_joints} of {joints.feature.key}: {', '.join(names)}",
+        "units": _sum_up_units(joints, names),
+        "links": links + " (its hands; --link names others)" * bool(links and not named),
+        "frames": ", ".join(places),
+        "events": ", ".join((*stored, *found)),
+        "held": _sum_up_holds(kept[0], default),
+    }
     return {name: text or "none" for name, text in lines.items()}
 
 
-def _unit(unit: str | Scale) -> str:
-    """A unit in words, or as the numbers that turn a stored value into it."""
-    if isinstance(unit, Scale):
+def _sum_up_holds(shown: Demonstration, default: bool) -> str:
+    """Sum up what is held, and what may follow from it for the operators."""
+    rounded = [
+        replace(h, begin=round(h.begin, 2), end=round(h.end, 2)) for h in shown.holds or ()
+    ]
+    counts = bool(rounded) and default and len(shown.frames) > 1
+    return ", ".join(map(str, rounded)) + " (put onto an object: --operator auto)" * counts
+
+
+def _place(frame: Any) -> str:
+    """Return where a frame's poses come from."""
+    at = getattr(frame, "at", None) or getattr(frame, "feature", None)
+    return at or "given"
+
+
+def _sum_up_units(joints: Any, names: Sequence[str]) -> str:
+    """Sum up the units, with their joints where there are several."""
+    units: dict[str, list[str]] = {}
+    for name, unit in zip(joints.names or ("all",), joints.units, strict=False):
+        if name in names or not names:
+            units.setdefault(_describe_unit(unit), []).append(name)
+    several = len(units) > 1
+    return "; ".join(f"{u}: {', '.join(of)}" if several else u for u, of in units.items())
+
+
+def _describe_unit(unit: str | Scale) -> str:
+    """Describe a unit in words, or by the numbers that turn a stored value into it."""
+    if not isinstance(unit, str):
         return f"{unit.factor:.4g} x value {unit.offset:+.4g} rad or m"
     return "rad or m" if unit == "auto" else unit
 
 
-def _echo(lines: dict[str, object]) -> None:
+def _echo(lines: dict[str, str]) -> None:
     for name, text in lines.items():
         typer.echo(f"{name:<16} {text}")
 
 
-def _report(learned: Any, read: Any, aligned: Any) -> None:
+def _report(learned: Any, read: Any, aligned: Any, reports: list[str]) -> None:
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.operators.text import format_operator
+
     skill = getattr(learned, "skill", learned)
-    lines: dict[str, object] = {}
+    lines: dict[str, str] = {}
     for number, one in enumerate(getattr(learned, "skills", ()), start=1):
         texts = ", ".join(map(format_operator, one.operators))
         lines[f"{'part' if one.begin > skill.begin or number == 1 else 'way'} {number}"] = (
             f"{one.begin:.2f} to {one.end:.2f} s, {len(one.log_weights)} components: {texts}"
         )
     if isinstance(learned, TaskParameterizedGMM):
-        lines |= _learning(learned, read, aligned)
+        lines |= _sum_up_model(learned, read, aligned)
     _echo(lines)
+    for text in reports:
+        typer.echo(f"\n{text}\n")
 
 
-def _learning(model: TaskParameterizedGMM, read: Any, aligned: Any) -> dict[str, object]:
-    lines: dict[str, object] = {}
+def _sum_up_model(model: TaskParameterizedGMM, read: Any, aligned: Any) -> dict[str, str]:
+    import numpy as np
+
+    from tpgmm_torch.operators.text import format_operator
+
+    lines: dict[str, str] = {}
     for number, operator in enumerate(model.operators_, start=1):
         size = operator.dimension(model.kinematics_)
         lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"

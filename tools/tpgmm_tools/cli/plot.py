@@ -68,9 +68,7 @@ def plot(
     situation = Situation.of(demonstrations[0])
     skill: Any = fitted.skill
     [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
-    shown: list[tuple[Any, Any, Any]] = [
-        (trajectory, situation.frames_at(trajectory.time.cpu()), {})
-    ]
+    motion: Any = trajectory, situation.frames_at(trajectory.time.cpu()), {}
     drawings = {}
     labels = [fill(format_operator(operator), 60) for operator in fitted.operators_]
     for index, operator in enumerate(fitted.operators_):
@@ -79,7 +77,7 @@ def plot(
             len(names), labels[index], height=1.3
         )
         for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
-            plot_local(axes, fitted, index, column, demonstrations, shown)
+            plot_local(axes, fitted, index, column, demonstrations, [motion])
             axes.set_ylabel(name, fontsize="small")
     for name in joint or ():
         title = f"{name}: each operator's estimate, and the result"
@@ -92,7 +90,7 @@ def plot(
 
 
 def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
-    """A label for each local coordinate of an operator.
+    """Return a label for each local coordinate of an operator.
 
     Parameters
     ----------
@@ -101,13 +99,21 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
     """
     from tpgmm_torch import operators as kinds
 
-    if isinstance(operator, kinds.Stack):
-        return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
-    if isinstance(operator, kinds.Canonical):
-        names = kinematics.joint_names
-        return [names[column] for column in operator.columns(names)]
-    if isinstance(operator, kinds.AbsolutePosition | kinds.RelativePosition):
-        return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    match operator:
+        case kinds.Stack():
+            return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
+        case kinds.Canonical():
+            names = kinematics.joint_names
+            return [names[column] for column in operator.columns(names)]
+        case kinds.AbsolutePosition() | kinds.RelativePosition():
+            return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    return _other_names(operator, kinematics)
+
+
+def _other_names(operator: Any, kinematics: Kinematics) -> list[str]:
+    """Label forces, parts of rotation vectors and quaternions, and number all else."""
+    from tpgmm_torch import operators as kinds
+
     if isinstance(operator, kinds.Wrench):
         forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
         return [*forces, f"{operator.link}\ncontact"]

@@ -25,10 +25,7 @@ def report(
     alignment: options.Alignments = "dtw",
     situation: int = 0,
     most: int = 10,
-    object_: list[str] | None = None,
-    meshes: Path | None = None,
-    obstacles: Path | None = None,
-    visuals: bool = False,
+    around: options.SceneOptions,
 ) -> None:
     """Write one HTML page about a model, for yourself and for those who have to trust it.
 
@@ -50,39 +47,19 @@ def report(
         The episode whose situation is shown, counted from 0.
     most : int >= 3
         Of more episodes, only this number is left out, one after the other.
-    object_ : ``FRAME=SHAPE``
-        What an object looks like, as for 'tpgmm view', repeatable.
-    meshes : ``FOLDER``
-        The robot's mesh files.
-    obstacles : ``FILE.xml``
-        An MJCF with what stands around, as for 'tpgmm reproduce': what touches it is listed.
-    visuals : bool
-        With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
-    import torch
-    from rich.console import Console
-    from rich.progress import Progress
-
     from tpgmm_tools.report import write_report
-    from tpgmm_torch.persistence import load_model
     from tpgmm_torch.structure.choices import prepared
 
-    torch.set_num_threads(1)
-    fitted = load_model(model, device="cpu")
+    fitted = options.load_one_thread(model)
     robot = fitted.kinematics_
     shown = options.align(data.read(dataset, robot), alignment, robot)
     shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
     options.check_situation(situation, len(shown))
-    how = options.look(object_, meshes, obstacles, visuals, fitted.skill, shown)
+    how = around.read(fitted.skill, shown) | {"situation": situation, "most": most}
     place = out or Path(f"{model}.html")
     folder = model.resolve()
     title = folder.parent.name if folder.name == "model" else folder.name
-    how |= {"situation": situation, "most": most, "title": title}
-    console = Console(stderr=True)
-    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("leaving one out")
-        write_report(
-            place, fitted, shown, **how,
-            progress=lambda done, of: bar.update(task, completed=done, total=of),
-        )  # fmt: skip
+    with options.show_progress("leaving one out") as progress:
+        write_report(place, fitted, shown, title=title, progress=progress, **how)
     typer.echo(f"{place.stat().st_size / 1e6:.1f} MB in {place}")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from tpgmm_tools.arguments import options
 
 if TYPE_CHECKING:
+    from tpgmm_control.obstacles import Scene
+    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -75,20 +78,17 @@ def reproduce(
         With --obstacles, take the robot's visual geometry where it has no collision geometry.
     """
     from tpgmm_control.loop.rollout import rollout
-    from tpgmm_datasets.tables import trajectories_to_frame, write_table
-    from tpgmm_torch.exceptions import DataError, UnknownNameError
+    from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.persistence import load_skill
-    from tpgmm_torch.skills.situations import at_first
     from tpgmm_torch.skills.via_points import ViaPoints
-    from tpgmm_torch.skills.ways import Ways
 
     if out.suffix not in FORMATS:
-        raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
+        raise options.refuse(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
-        raise DataError("give either --situations FILE.json or --dataset DATASET")
+        raise options.refuse("give either --situations FILE.json or --dataset DATASET")
     skill = load_skill(model, device="cpu")
     kinematics = skill.kinematics
-    wanted, shown = options.wanted(situations, dataset, data, kinematics)
+    wanted, shown = options.read_situations(situations, dataset, data, kinematics)
     if via:
         skill = ViaPoints(skill, via, fade)
     try:
@@ -96,30 +96,48 @@ def reproduce(
     except UnknownNameError as error:
         if error.kind != "frame" or dataset is None:
             raise
-        raise DataError(
+        raise options.refuse(
             f"{error}. Say where it is in the data set, as to 'tpgmm fit': --frame "
             f"{error.name}=FEATURE or --frame {error.name}=LINK@EVENT"
         ) from error
-    pairs = zip(trajectories, wanted, strict=True)
-    frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
-    write_table(trajectories_to_frame(trajectories, frames), out)
-    for number, trajectory in enumerate(trajectories):
-        typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
-    for number, one in enumerate(wanted if isinstance(skill, Ways) else ()):
-        situation = one.reordered(kinematics.joint_names)
-        [choice] = skill.choose(situation.joints, at_first(situation))
-        typer.echo(f"{number:>4}  {choice}")
+    _write(trajectories, wanted, out)
+    descriptions = [_describe(one, kinematics) for one in trajectories]
+    for number, text in [*enumerate(descriptions), *enumerate(_choose_ways(skill, wanted))]:
+        typer.echo(f"{number:>4}  {text}")
     typer.echo(f"written to {out}")
     if obstacles is not None:
-        from tpgmm_tools.contacts import contacts
+        scene = options.read_obstacles(obstacles, skill, visuals, shown)
+        _report_contacts(scene, trajectories, wanted, skill.holds)
 
-        scene = options.scene(obstacles, skill, visuals, shown)
-        found = list(contacts(scene, trajectories, wanted, skill.holds))
-        for number, contact in found:
-            typer.echo(f"{number:>4}  {contact}")
-        if found:
-            raise typer.Exit(COLLIDES)
-        typer.echo("nothing touches")
+
+def _write(motions: list[Trajectory], situations: list[Situation], out: Path) -> None:
+    from tpgmm_datasets.tables import trajectories_to_frame, write_table
+
+    pairs = zip(motions, situations, strict=True)
+    frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
+    write_table(trajectories_to_frame(motions, frames), out)
+
+
+def _choose_ways(skill: Any, situations: list[Situation]) -> Iterator[object]:
+    """Choose a way in each situation, if the skill has several."""
+    from tpgmm_torch.skills.situations import at_first
+    from tpgmm_torch.skills.ways import Ways
+
+    for one in situations if isinstance(skill, Ways) else ():
+        situation = one.reordered(skill.kinematics.joint_names)
+        yield from skill.choose(situation.joints, at_first(situation))
+
+
+def _report_contacts(scene: Scene, *motions: Any) -> None:
+    """Print what touches obstacles; end with an exit code of its own if anything does."""
+    from tpgmm_tools.contacts import contacts
+
+    found = list(contacts(scene, *motions))
+    for number, contact in found:
+        typer.echo(f"{number:>4}  {contact}")
+    if found:
+        raise typer.Exit(COLLIDES)
+    typer.echo("nothing touches")
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
@@ -129,12 +147,12 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
     speed = largest_speeds(trajectory)
     beyond = (kinematics.lower - joints).maximum(joints - kinematics.upper).amax(0)
     fast = speed > kinematics.velocity * (1 + tolerance)
-    problems = [
-        f"{name} beyond its limit by {float(by):.3g} rad" if by > tolerance else
-        f"{name} faster than its limit"
-        for name, by, too_fast in zip(trajectory.joint_names, beyond, fast, strict=True)
-        if by > tolerance or too_fast
-    ]  # fmt: skip
+    problems = []
+    for name, by, too_fast in zip(trajectory.joint_names, beyond, fast, strict=True):
+        if by > tolerance:
+            problems.append(f"{name} beyond its limit by {float(by):.3g} rad")
+        elif too_fast:
+            problems.append(f"{name} faster than its limit")
     novelty = trajectory.novelty
     return (
         f"{float(trajectory.time[-1] - trajectory.time[0]):6.2f} s  "

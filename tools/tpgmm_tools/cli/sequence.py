@@ -49,13 +49,12 @@ def sequence(
         For --format lerobot, the LeRobot data set whose states, actions and rate it has.
     """
     from tpgmm_datasets.signals import Signals
-    from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.persistence import load_skill, save
     from tpgmm_torch.skills.sequence import Sequence
 
     write = model_format(format_)
     if (write is None) != (dataset is None):
-        raise DataError(
+        raise options.refuse(
             "--format lerobot and --dataset go together: a policy's signals are its"
         )
     made = Sequence.parse(text, load_skill, fade=fade, timeout=timeout)

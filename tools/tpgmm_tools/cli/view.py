@@ -32,11 +32,8 @@ def view(
     dataset: str | None = None,
     situations: Path | None = None,
     situation: int = 0,
-    object_: list[str] | None = None,
-    meshes: Path | None = None,
     fps: float = 25.0,
-    obstacles: Path | None = None,
-    visuals: bool = False,
+    around: options.SceneOptions,
     live: bool = False,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -63,18 +60,8 @@ def view(
         Situations, as 'tpgmm reproduce' takes them, instead of the data set's.
     situation : int >= 0
         Which of the situations is shown, counted from 0.
-    object_ : ``FRAME=SHAPE``
-        What an object looks like, repeatable: box:X,Y,Z, cylinder:RADIUS,LENGTH or
-        sphere:RADIUS in metres, at the origin of its frame; else a small box.
-    meshes : ``FOLDER``
-        The robot's mesh files; without them, sticks stand for meshes.
     fps : float >= 1
         Pictures per second.
-    obstacles : ``FILE.xml``
-        An MJCF with what stands around, as for 'tpgmm reproduce': it is drawn, and with --live
-        the controller keeps clear of it.
-    visuals : bool
-        With --obstacles, take the robot's visual geometry where it has no collision geometry.
     live : bool
         Serve the page instead: objects can be moved by hand, and the skill is reproduced for
         where they are.
@@ -83,40 +70,37 @@ def view(
     port : int
         First port to try, with --live.
     """
-    import torch
-
     from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
-    from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.persistence import load_model
 
-    # the matrices are small: a second thread on a busy machine only spins
-    torch.set_num_threads(1)
     suffix = SUFFIXES[format_]
-    where, place = model, out or Path(f"{model}{suffix}")
-    if place.suffix != suffix:
-        raise DataError(f"--out ends in {suffix}, got {str(place)!r}")
-    if format_ == "rerun" and live:
-        raise DataError("--live serves a page, --format rerun writes a file: give one of them")
-    if (model / "model").is_dir() and (model / "dataset").is_dir():
-        where, dataset = model / "model", dataset or str(model / "dataset")
-    if situations is None and dataset is None:
-        raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
-    fitted = load_model(where, device="cpu")
-    wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
-    options.check_situation(situation, len(wanted))
-    how = options.look(object_, meshes, obstacles, visuals, fitted.skill, demonstrations)
-    how["fps"] = fps
+    folder, place = model, out or Path(f"{model}{suffix}")
+    if (folder / "model").is_dir() and (folder / "dataset").is_dir():
+        model, dataset = folder / "model", dataset or str(folder / "dataset")
+    _check(place, suffix, live, shown=bool(dataset or situations))
+    fitted = options.load_one_thread(model)
+    known, shown = options.read_situations(situations, dataset, data, fitted.kinematics_)
+    options.check_situation(situation, len(known))
+    how = around.read(fitted.skill, shown) | {"fps": fps}
     if live:
-        at = {"host": host, "port": port, "first": situation, **how}
-        with (
-            LiveView(fitted, wanted, demonstrations, **at) as shown,
-            suppress(KeyboardInterrupt),
-        ):
-            typer.echo(f"open {shown.url} in a browser; stop with Ctrl-C")
-            shown.run()
+        served = LiveView(fitted, known, shown, host=host, port=port, first=situation, **how)
+        with served, suppress(KeyboardInterrupt):
+            typer.echo(f"open {served.url} in a browser; stop with Ctrl-C")
+            served.run()
         return
-    how["title"] = f"{model.resolve().name}, situation {situation}"
     write = write_rerun if format_ == "rerun" else write_motion
-    trajectory = write(place, fitted, wanted[situation], demonstrations, **how)
-    seconds = float(trajectory.time[-1] - trajectory.time[0])
-    typer.echo(f"{seconds:.1f} s of motion, {place.stat().st_size / 1e6:.1f} MB, in {place}")
+    title = f"{folder.resolve().name}, situation {situation}"
+    time = write(place, fitted, known[situation], shown, title=title, **how).time
+    size = place.stat().st_size / 1e6
+    typer.echo(f"{float(time[-1] - time[0]):.1f} s of motion, {size:.1f} MB, in {place}")
+
+
+def _check(place: Path, suffix: str, live: bool, shown: bool) -> None:
+    """Refuse a file of another kind, what does not go together, and nothing to show."""
+    if place.suffix != suffix:
+        raise options.refuse(f"--out ends in {suffix}, got {str(place)!r}")
+    if suffix == SUFFIXES["rerun"] and live:
+        raise options.refuse(
+            "--live serves a page, --format rerun writes a file: give one of them"
+        )
+    if not shown:
+        raise options.refuse("give --dataset DATASET or --situations FILE.json: what to show")

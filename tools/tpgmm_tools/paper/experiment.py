@@ -64,6 +64,7 @@ class BottleExperiment:
     n_components : int, default=30
         K of the model.
     n_demonstrations : int, default=10
+        Generated, to learn from.
     n_situations : int, default=50
         Unseen bottle poses and start postures.
     seed : int, default=0
@@ -178,12 +179,12 @@ class BottleExperiment:
 def _run(
     skill: Any, situations: Sequence[Situation], candidates: bool = False
 ) -> list[Trajectory]:
-    """Reproductions within the robot's bounds, faded in from the start posture."""
+    """Reproduce within the robot's bounds, faded in from the start posture."""
     return rollout(skill, situations, bounds="robot", blend=1.0, candidates=candidates)
 
 
 class _Measure:
-    """The figures of merit, against aligned demonstrations."""
+    """Figures of merit, against aligned demonstrations."""
 
     def __init__(self, skill: BottleShaking, aligned: Sequence[Demonstration]) -> None:
         self.skill, self.aligned, self.time = skill, aligned, aligned[0].time
@@ -207,7 +208,7 @@ class _Measure:
     def __call__(
         self, trajectories: Sequence[Trajectory], situations: Sequence[Situation]
     ) -> dict[str, Any]:
-        """Median and 95th percentile over the situations; the worst where limits count."""
+        """Compute median and 95th percentile over situations; the worst where limits count."""
         joints = torch.stack([trajectory.joints for trajectory in trajectories])
         starts = torch.stack([situation.joints for situation in situations])
         bottles = Frame.stack([situation.frames["bottle"] for situation in situations])
@@ -231,12 +232,12 @@ class _Measure:
         )
 
     def _rhythm(self, shoulders: Tensor) -> NDArray[np.float64]:
-        """Frequency and amplitude, the mean of both shoulders."""
+        """Fit frequency and amplitude, the mean of both shoulders."""
         fits = [sinusoid(self.time[self.steady], side[self.steady]) for side in shoulders.T]
         return np.mean([(fit.frequency, fit.amplitude) for fit in fits], axis=0)
 
     def shares(self, trajectories: Sequence[Trajectory]) -> dict[str, float]:
-        """Figure 6 in two numbers: who determines the shoulders, and when."""
+        """Compute figure 6 in two numbers: who determines the shoulders, and when."""
         columns = [self.skill.robot.joint_names.index(name) for name in SHOULDERS]
         shares = [torch.stack([t.candidates[j].share for t in trajectories]) for j in (0, 1)]
         task, canonical = (share[..., columns].mean((0, -1)) for share in shares)
@@ -251,7 +252,7 @@ class _Measure:
         paths: Sequence[NDArray[np.float64]],
         trajectories: Sequence[Trajectory],
     ) -> dict[str, float]:
-        """How unlike the demonstrations shake, and the reproductions from each of them.
+        """Measure how unlike the demonstrations shake, and the reproductions from each of them.
 
         The true phase of a demonstration is known from its events, and ``paths`` are its
         instants at each time of the common clock [s].
@@ -270,7 +271,7 @@ class _Measure:
         }
 
     def demonstrations(self, demonstrations: Sequence[Demonstration]) -> dict[str, Any]:
-        """Errors of the demonstrations themselves, before alignment."""
+        """Measure errors of the demonstrations themselves, before alignment."""
         contacts = [
             d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))] for d in demonstrations
         ]

@@ -37,7 +37,7 @@ class Sinusoid:
 
 
 def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
-    """The sinusoid of least squares through a signal.
+    """Fit the sinusoid of least squares through a signal.
 
     The frequency is searched between one period in the window and the Nyquist frequency,
     coarsely by steps of a fifth of a period in the window, then by golden sections.

@@ -6,6 +6,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 
@@ -18,37 +19,13 @@ from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "Curve",
-    "Mark",
-    "Panel",
-    "as_html",
-    "motion_marks",
-    "motion_panels",
-    "turning_joints",
-]
+    "Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels", "turning_joints",
+]  # fmt: skip
 
 #: Of stiffness: the ellipsoids' colour, as both show the covariance.
 STIFFNESS = "#1f77b4"
 #: Of the operators; none is the reproduced path's or the ellipsoids'.
 OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
-
-# The time line's position is in the page's first input; without one there is no marker. On a
-# narrow page the curves would hide the robot: there they begin folded, but on a phone, upright.
-FOLLOW = """
-(() => {
-  document.getElementById('curves').open = innerWidth >= 700 || innerHeight >= 2 * innerWidth;
-  const marks = document.querySelectorAll('#curves .now');
-  const follow = () => {
-    const clock = Math.min(END, parseFloat(document.querySelector('input')?.value));
-    for (const mark of marks) {
-      mark.setAttribute('visibility', Number.isFinite(clock) ? 'visible' : 'hidden');
-      if (Number.isFinite(clock)) mark.setAttribute('transform', `translate(${clock})`);
-    }
-    requestAnimationFrame(follow);
-  };
-  follow();
-})();
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +86,7 @@ class Mark:
 
 
 def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Mark]:
-    """Events of the demonstrations within a motion, by time.
+    """Return events of the demonstrations within a motion, by time.
 
     Parameters
     ----------
@@ -127,7 +104,7 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
 
 
 def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Panel]:
-    """Stiffness and the operators' shares, over time.
+    """Compute stiffness and the operators' shares, over time.
 
     Parameters
     ----------
@@ -160,25 +137,17 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
     if model.holds_:
         skill = as_array(trajectory.time)
+        holds = [(hold.begin <= skill) & (skill <= hold.end) for hold in model.holds_]
         held = [
-            Curve(
-                f"{hold.frame} by {hold.link}",
-                color,
-                ((hold.begin <= skill) & (skill <= hold.end)).astype(float),
-            )
-            for hold, color in zip(model.holds_, cycle(OPERATORS), strict=False)
+            Curve(f"{hold.frame} by {hold.link}", color, one.astype(float))
+            for hold, one, color in zip(model.holds_, holds, cycle(OPERATORS), strict=False)
         ]
         panels.append(Panel("held", time, held, 1.0))
     return panels
 
 
 def turning_joints(kinematics: Kinematics) -> list[int]:
-    """Indices of joints in rad, as tracked quaternions and lengths are not.
-
-    Parameters
-    ----------
-    kinematics : Kinematics
-    """
+    """Return indices of joints of some ``kinematics`` in rad: no quaternions, no lengths."""
     others = {*kinematics.lengths}
     for start in kinematics.quaternion_starts:
         others.update(range(start, start + 4))
@@ -186,7 +155,7 @@ def turning_joints(kinematics: Kinematics) -> list[int]:
 
 
 def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
-    """The panels as a part of a page, to be folded away; a marker follows the time line.
+    """Write panels as a part of a page, to be folded away; a marker follows the time line.
 
     Drawings have seconds and the curves' own units for coordinates, upwards.
 
@@ -198,6 +167,7 @@ def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
         Dashed lines through all of them, named below.
     """
     end = panels[0].time[-1]
+    follow = Path(__file__).with_name("follow.js").read_text(encoding="utf-8")
     drawn = "".join(_figure(panel, marks) for panel in panels)
     drawn += "".join(
         f'<div class="row"><span>&#9478; {html.escape(mark.label)}</span>'
@@ -207,7 +177,7 @@ def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
     return (
         '<details id="curves" open><summary>curves over time</summary>'
         f'{drawn}<div class="row"><span>0 s</span><span>{end:.1f} s</span></div></details>'
-        f"<script>{FOLLOW.replace('END', f'{end:.6g}')}</script>"
+        f"<script>{follow.replace('END', f'{end:.6g}')}</script>"
     )
 
 

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
 
 from tpgmm_control.loop.command import Command
 from tpgmm_control.loop.controller import Controller
 from tpgmm_tools.viewing.curves import as_html, motion_marks, motion_panels
 from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
 from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
-from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -35,28 +33,7 @@ __all__ = ["LiveView", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
-#: The page is light in any browser. On a narrow one the curves go above the legend; on a phone,
-#: upright, both go below the scene, so that the scene is wide enough for two arms.
-STYLE = """
-#legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
-display:flex;flex-wrap:wrap-reverse;justify-content:space-between;align-items:end;gap:.5em;
-font:14px sans-serif;color:#333}
-#legend>*{background:rgba(255,255,255,.9);padding:.5em;box-sizing:border-box;max-width:100%}
-#curves{width:24em;font-size:12px;overflow-wrap:anywhere}
-#curves summary{pointer-events:auto;cursor:pointer}
-#curves .row{display:flex;justify-content:space-between;gap:1em}
-#curves .row :last-child{white-space:nowrap}
-#curves svg{display:block;width:100%;height:3.5em;overflow:visible;
-border-bottom:1px solid currentColor}
-#curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
-#curves line{stroke:currentColor;stroke-width:1}
-#curves .mark{stroke-dasharray:3 3;opacity:.6}
-@media (max-aspect-ratio:3/5){#root{height:120vw!important}
-#legend{top:120vw;bottom:auto;left:0;right:0;flex-flow:column;align-items:stretch;gap:0}
-#curves{width:100%}}
-"""
-
-Dragged = Callable[[str, Any], None]
+OnDrag = Callable[[str, Any], None]
 
 
 def write_motion(
@@ -118,7 +95,7 @@ def write_motion(
 
 
 def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
-    """The colours' meaning, and the curves, along the lower edge."""
+    """Write the colours' meaning, and the curves, along the lower edge."""
     entries = {
         "reproduction": "reproduction",
         "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
@@ -129,15 +106,16 @@ def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
         f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
         for kind, text in entries.items()
     )
+    style = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     return (
-        f'<style>{STYLE}</style><div id="legend">'
+        f'<style>{style}</style><div id="legend">'
         f"<div><b>{html.escape(title)}</b>{lines}</div>{curves}</div>"
     )
 
 
 @contextmanager
 def viser_server(host: str, port: int) -> Iterator[Any]:
-    """A viser server on ``host`` and ``port`` (0 for any that is free) that stops in the end.
+    """Serve by viser on ``host`` and ``port`` (0 for any that is free), and stop in the end.
 
     Raises
     ------
@@ -163,9 +141,9 @@ def draw(
     scene: Any,
     drawing: Drawing,
     handles: Mapping[str, Any] | None = None,
-    dragged: Dragged | None = None,
+    on_drag: OnDrag | None = None,
 ) -> dict[str, Any]:
-    """Draw into a viser scene; its nodes by their path.
+    """Draw into a viser scene, and return its nodes by their path.
 
     Parameters
     ----------
@@ -175,7 +153,7 @@ def draw(
         The motion.
     handles : mapping of str to viser.SceneNodeHandle, optional
         Nodes that are there already, of another motion of the same model.
-    dragged : callable, optional
+    on_drag : callable, optional
         Makes objects movable by hand: called with the name of one, and viser's event.
     """
     nodes = dict(handles or {})
@@ -183,7 +161,7 @@ def draw(
         nodes.pop(gone).remove()
     for path, node in drawing.nodes.items():
         if path not in nodes:
-            nodes[path] = _add_node(scene, path, node, drawing.size, dragged)
+            nodes[path] = _add_node(scene, path, node, drawing.size, on_drag)
     for path, lines in drawing.lines.items():
         scene.add_line_segments(
             path, points=lines.points, colors=lines.color, thickness=lines.thickness,
@@ -226,12 +204,12 @@ def place(handle: Any, pose: Array) -> None:
     handle.position, handle.wxyz = pose[:3], pose[3:]
 
 
-def _add_node(scene: Any, path: str, node: Node, size: float, dragged: Dragged | None) -> Any:
+def _add_node(scene: Any, path: str, node: Node, size: float, on_drag: OnDrag | None) -> Any:
     axes = {"axes_length": node.axes, "axes_radius": 0.03 * node.axes, "origin_radius": 0.0}
-    if dragged is not None and path.startswith("/frames/"):
+    if on_drag is not None and path.startswith("/frames/"):
         handle = scene.add_transform_controls(path, scale=0.12 * size, disable_sliders=True)
         scene.add_frame(f"{path}/axes", **axes)
-        handle.on_update(partial(dragged, node.label))
+        handle.on_update(partial(on_drag, node.label))
     else:
         handle = scene.add_frame(path, node.axes > 0, **axes)
     if node.label:
@@ -242,10 +220,10 @@ def _add_node(scene: Any, path: str, node: Node, size: float, dragged: Dragged |
 
 
 def _add_solid(scene: Any, path: str, shape: Shape) -> None:
-    turn = torch.from_numpy(np.ascontiguousarray(shape.pose[:3, :3]))
+    pose = shape.placement
     placed: dict[str, Any] = {
-        "position": shape.pose[:3, 3],
-        "wxyz": quaternions.from_matrix(turn).numpy(),
+        "position": pose[:3],
+        "wxyz": pose[3:],
         "color": shape.color,
         "opacity": None if shape.opacity >= 1 else shape.opacity,
     }
@@ -259,7 +237,7 @@ def _add_solid(scene: Any, path: str, shape: Shape) -> None:
 
 
 def _set_view(server: Any, drawing: Drawing) -> None:
-    """Camera, lights and floor."""
+    """Set camera, lights and floor."""
     size, camera = drawing.size, server.initial_camera
     camera.look_at = drawing.middle
     camera.position = camera.look_at + drawing.distance * np.array([0.8, 0.5, 0.35])
@@ -347,7 +325,7 @@ class LiveView:
             self._resources = stack.pop_all()
 
     def __enter__(self) -> Self:
-        """The view, which runs since it was made."""
+        """Return the view, which runs since it was made."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -415,7 +393,7 @@ class LiveView:
             self._move_to(self.clock)
 
     def _frames_now(self) -> dict[str, Frame]:
-        """Poses of the model's objects at the instant that is shown."""
+        """Return poses of the model's objects at the instant that is shown."""
         instants = self.drawing.trajectory.time
         at = min(int((instants - instants[0] < self.clock).sum()), len(instants) - 1)
         frames = self.situation.frames_at(instants)
@@ -454,8 +432,8 @@ class LiveView:
             numbers = [str(index) for index in range(len(self._situations))]
             chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])
             chosen.on_update(lambda event: self.show(int(event.target.value)))
-        self._slider.on_update(self._slid)
-        self._run.on_update(self._switched)
+        self._slider.on_update(self._seek)
+        self._run.on_update(self._switch_controller)
 
     def _step_back(self, client: Any) -> None:
         """See both arms on a page that is higher than wide, as on a phone."""
@@ -468,11 +446,11 @@ class LiveView:
         if not self._dragged:
             self.move_frame(name, Frame(event.target.position, event.target.wxyz))
 
-    def _slid(self, event: Any) -> None:
+    def _seek(self, event: Any) -> None:
         if event.client is not None:  # moved by hand, not by the clock
             self._play.value, self.clock = False, event.target.value
             self.stop_controller()
 
-    def _switched(self, event: Any) -> None:
+    def _switch_controller(self, event: Any) -> None:
         if event.client is not None:
             (self.start_controller if event.target.value else self.stop_controller)()

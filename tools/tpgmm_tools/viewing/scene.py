@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -122,7 +123,7 @@ class Drawing:
     ground: float
 
     def picture(self, seconds: float) -> int:
-        """Number of the picture at some ``seconds`` after the start."""
+        """Return the number of the picture at some ``seconds`` after the start."""
         return min(int(np.searchsorted(self.time, seconds - 1e-9)), len(self.time) - 1)
 
 
@@ -219,7 +220,7 @@ class MotionScene:
         )
 
     def robot_poses(self, joints: Tensor) -> dict[str, Array]:
-        """Poses (1, 7) of all links at ``joints`` (n_joints,), by their path."""
+        """Return the poses (1, 7) of all links at ``joints`` (n_joints,), by their path."""
         state = self._body.state(joints.cpu())
         poses = _poses(state.positions, state.orientations)[None]
         return {path: node.poses for path, node in self._robot(poses)}
@@ -234,24 +235,24 @@ class MotionScene:
         edges = (0.06 * self._size,) * 3
         unknown = Shape("box", edges, np.eye(4), OBJECT_COLOR, OBJECT_OPACITY)
         for name, some in poses.items():
-            shape = (self.objects or {}).get(name, unknown)
-            yield (
-                f"/frames/{_node(name)}",
-                Node(some, {"shape": shape}, 0.09 * self._size, name),
-            )
+            solids = {"shape": (self.objects or {}).get(name, unknown)}
+            yield f"/frames/{_node(name)}", Node(some, solids, 0.09 * self._size, name)
 
     def _surroundings(self) -> Iterator[tuple[str, Node]]:
-        """Obstacles that stand still."""
+        """Make nodes of obstacles that stand still."""
         known = [] if self.obstacles is None else self.obstacles.shapes
         for number, one in enumerate(known):
             if one.carrier is None and one.kind in DRAWN:
                 pose = _poses(one.pose.position, one.pose.orientation)[None]
-                yield f"/obstacles/{number}", Node(pose, dict(_drawn(one)), label=one.name)
+                yield (
+                    f"/obstacles/{number}",
+                    Node(pose, dict(_obstacle_solids(one)), label=one.name),
+                )
 
     def _object_poses(
         self, frames: Mapping[str, Frame], state: RobotState, steps: Tensor, time: Tensor
     ) -> Iterator[tuple[str, Array]]:
-        """Poses (F, 7) or (1, 7): recorded ones until an object is held, then its link's."""
+        """Return poses (F, 7) or (1, 7): recorded until an object is held, then the link's."""
         shown = {name: f[steps] if f.batch_shape else f for name, f in frames.items()}
         holds = [one for one in self.model.holds_ if one.frame in frames]
         taken = {one.frame: one.begin for one in reversed(holds)}
@@ -273,14 +274,14 @@ class MotionScene:
     def _demonstrated_paths(self) -> Iterator[tuple[str, Lines]]:
         for index, link in enumerate(self._links if self._shown else ()):
             pairs = zip(self._shown, self._paths, strict=True)
-            points = [_segments(one.time, path[:, index]) for one, path in pairs]
-            yield (
-                f"/demonstrations/{_node(link)}",
-                Lines(np.concatenate(points), COLORS["demonstrations"], 1.2),
+            points = np.concatenate(
+                [_segments(one.time, path[:, index]) for one, path in pairs]
             )
+            lines = Lines(points, COLORS["demonstrations"], 1.2)
+            yield f"/demonstrations/{_node(link)}", lines
 
     def _demonstrated_frames(self) -> Iterator[tuple[str, Array]]:
-        """Where objects stood at first: why paths differ."""
+        """Collect where objects stood at first: why paths differ."""
         for name in self._shown[0].frames if self._shown else ():
             frames = [one.frames[name] for one in self._shown]
             first = [frame[0] if frame.batch_shape else frame for frame in frames]
@@ -288,38 +289,40 @@ class MotionScene:
             yield f"/demonstrations/{_node(name)}", np.stack(poses)
 
 
-def _drawn(one: Obstacle) -> Iterator[tuple[str, Shape]]:
-    """The solids that an obstacle is drawn as."""
+def _obstacle_solids(one: Obstacle) -> Iterator[tuple[str, Shape]]:
+    """Make the solids that an obstacle is drawn as."""
+
+    def solid(kind: Any, size: tuple[float, ...], height: float = 0.0) -> Shape:
+        pose = np.eye(4)
+        pose[2, 3] = height
+        return Shape(kind, size, pose, OBSTACLE_COLOR, OBJECT_OPACITY)
+
     radius, *lengths = one.size
     if one.kind == "box":
-        edges = tuple(2 * x for x in one.size)
-        yield "box", Shape("box", edges, np.eye(4), OBSTACLE_COLOR, OBJECT_OPACITY)
+        yield "box", solid("box", tuple(2 * x for x in one.size))
         return
     half = lengths[0] if lengths else 0.0
     if half:
-        size = radius, 2 * half
-        yield "side", Shape("cylinder", size, np.eye(4), OBSTACLE_COLOR, OBJECT_OPACITY)
+        yield "side", solid("cylinder", (radius, 2 * half))
     for height in {half, -half} if one.kind != "cylinder" else ():
-        pose = np.eye(4)
-        pose[2, 3] = height
-        yield f"end {height}", Shape("sphere", (radius,), pose, OBSTACLE_COLOR, OBJECT_OPACITY)
+        yield f"end {height}", solid("sphere", (radius,), height)
 
 
 def _steps(time: Tensor, fps: float) -> Tensor:
-    """Which time steps are shown: the first at or after each picture's instant, the last."""
-    wanted = torch.arange(float(time[0]), float(time[-1]), 1 / fps, dtype=time.dtype)
-    steps = torch.searchsorted(time, wanted)
+    """Select the time steps to show: the first at or after each picture's instant, the last."""
+    instants = torch.arange(float(time[0]), float(time[-1]), 1 / fps, dtype=time.dtype)
+    steps = torch.searchsorted(time, instants)
     return torch.cat((steps, torch.tensor([len(time) - 1]))).unique()
 
 
 def _bounds(points: Sequence[Array]) -> tuple[Array, Array]:
-    """Least and greatest x, y, z."""
+    """Return the least and greatest x, y, z."""
     rows = np.concatenate([some.reshape(-1, 3) for some in points])
     return rows.min(axis=0), rows.max(axis=0)
 
 
 def _segments(time: Tensor, path: Array) -> Array:
-    """A path (T, 3) as segments (N, 2, 3) of equal duration along a cubic spline."""
+    """Cut a path (T, 3) into segments (N, 2, 3) of equal duration along a cubic spline."""
     instants = as_array(time)
     if len(path) > 1:
         even = np.linspace(instants[0], instants[-1], POINTS)
@@ -332,12 +335,12 @@ def _poses(positions: Tensor, orientations: Tensor) -> Array:
 
 
 def _node(name: str) -> str:
-    """A name as one step of a path in the scene."""
+    """Write a name as one step of a path in the scene."""
     return name.replace("/", "_")
 
 
 def ellipsoids(state: RobotState, covariance: Tensor, link: str) -> tuple[Tensor, Tensor]:
-    """Contours of the covariance of a link's position, ``J_p Sigma J_p^T`` to first order.
+    """Compute contours of the covariance of a link's position, ``J_p Sigma J_p^T``.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 import torch
 
+from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -58,7 +59,20 @@ class Shape:
     opacity: float = 1.0
     file: Path | None = None
 
+    @property
+    def placement(self) -> Array:
+        """The pose as position [m] and quaternion, of shape (7,)."""
+        turn = torch.from_numpy(np.ascontiguousarray(self.pose[:3, :3]))
+        return np.concatenate((self.pose[:3, 3], quaternions.from_matrix(turn).numpy()))
 
+
+#: Attributes in URDF that say how large a solid is: name, number of values, default.
+ATTRIBUTES: Mapping[str, Sequence[tuple[str, int, str | None]]] = {
+    "box": [("size", 3, None)],
+    "cylinder": [("radius", 1, None), ("length", 1, None)],
+    "sphere": [("radius", 1, None)],
+    "mesh": [("scale", 3, "1 1 1")],
+}
 #: Of objects, and how many numbers say how large a solid is.
 OBJECT_COLOR: Color = (230, 159, 0)
 OBJECT_OPACITY = 0.6
@@ -66,7 +80,7 @@ SIZES: Mapping[str, int] = {"box": 3, "cylinder": 2, "sphere": 1}
 
 
 def parse_shape(text: str) -> Shape:
-    """An object's shape from text, about the origin of its frame.
+    """Read an object's shape from text, about the origin of its frame.
 
     Parameters
     ----------
@@ -98,7 +112,7 @@ def parse_shape(text: str) -> Shape:
 
 
 def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[Shape]]:
-    """The shapes of every link that has any, by name, in the link's frame.
+    """Return the shapes of every link that has any, by name, in the link's frame.
 
     Parameters
     ----------
@@ -120,11 +134,10 @@ def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[
     shapes: dict[str, list[Shape]] = {}
     for link, elements in visuals.items():
         read = (_shape(element, link, materials, meshes) for element in elements)
-        drawn = [shape for shape in read if shape is not None]
-        if not drawn and (elements or plain):
-            drawn = _sticks(model, link)
-        if drawn:
-            shapes[link] = drawn
+        if solids := [shape for shape in read if shape is not None]:
+            shapes[link] = solids
+        elif elements or plain:
+            shapes[link] = _sticks(model, link)
     return shapes
 
 
@@ -134,29 +147,31 @@ def _shape(
     materials: Mapping[str | None, ElementTree.Element],
     meshes: Path | None,
 ) -> Shape | None:
-    """One ``<visual>``; None for a mesh without a folder to look in."""
+    """Read a ``<visual>``; None for a mesh without a folder to look in."""
     geometry = visual.find("geometry")
     solids = [] if geometry is None else list(geometry)
-    if len(solids) != 1 or solids[0].tag not in ("box", "cylinder", "sphere", "mesh"):
+    if len(solids) != 1 or solids[0].tag not in ATTRIBUTES:
         raise DataError(
             f"a <visual> of link {link!r} needs one <box>, <cylinder>, <sphere> or <mesh> in "
             f"its <geometry>, got {[solid.tag for solid in solids]}"
         )
-    solid, origin = solids[0], visual.find("origin")
-    pose = np.eye(4)
-    if origin is not None:
-        xyz, rpy = (_numbers(origin, key, 3, link, "0 0 0") for key in ("xyz", "rpy"))
-        pose = placement(xyz, rpy)
+    [solid], pose = solids, _origin(visual, link)
     color, opacity = _color(visual, link, materials)
+    file = None
     if solid.tag == "mesh":
         if meshes is None:
             return None
-        scale = _numbers(solid, "scale", 3, link, "1 1 1")
         file = _mesh_file(solid.get("filename", ""), link, meshes)
-        return Shape("mesh", scale, pose, color, opacity, file)
-    keys = {"box": ["size"], "sphere": ["radius"], "cylinder": ["radius", "length"]}[solid.tag]
-    sizes = [_numbers(solid, key, 3 if key == "size" else 1, link) for key in keys]
-    return Shape(solid.tag, sum(sizes, ()), pose, color, opacity)  # type: ignore[arg-type]
+    sizes = [_numbers(solid, key, n, link, usual) for key, n, usual in ATTRIBUTES[solid.tag]]
+    return Shape(solid.tag, sum(sizes, ()), pose, color, opacity, file)  # type: ignore[arg-type]
+
+
+def _origin(visual: ElementTree.Element, link: str) -> Array:
+    origin = visual.find("origin")
+    if origin is None:
+        return np.eye(4)
+    xyz, rpy = (_numbers(origin, key, 3, link, "0 0 0") for key in ("xyz", "rpy"))
+    return placement(xyz, rpy)
 
 
 def _numbers(
@@ -180,7 +195,7 @@ def _color(
     link: str,
     materials: Mapping[str | None, ElementTree.Element],
 ) -> tuple[Color, float]:
-    """A material may be described in place, or once for the whole robot and named here."""
+    """Read a material: described in place, or once for the whole robot and named here."""
     material = visual.find("material")
     color = None if material is None else material.find("color")
     if material is not None and color is None and material.get("name") in materials:
@@ -202,14 +217,14 @@ def _mesh_file(name: str, link: str, folder: Path) -> Path:
 
 
 def _sticks(model: UrdfModel, link: str) -> list[Shape]:
-    """A stick to each joint that hangs on the link; a small ball where none does."""
+    """Make a stick to each joint that hangs on the link; a small ball where none does."""
     ends = [joint.origin[:3, 3] for joint in model.joints if joint.parent == link]
     sticks = [_stick(end) for end in ends if np.linalg.norm(end) > THINNEST]
     return sticks or [Shape("sphere", (2 * THINNEST,), np.eye(4))]
 
 
 def _stick(end: Array) -> Shape:
-    """A cylinder from the origin to ``end``: its z axis along that way."""
+    """Make a cylinder from the origin to ``end``: its z axis along that way."""
     length = float(np.linalg.norm(end))
     z = end / length
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
@@ -223,7 +238,7 @@ def _stick(end: Array) -> Shape:
 def whole_body(
     kinematics: Kinematics, meshes: Path | None = None
 ) -> tuple[Kinematics, Mapping[str, Sequence[Shape]]]:
-    """All links that can be seen: their kinematics in float64 on the CPU, and their shapes.
+    """Return the kinematics of all links that can be seen, in float64 on the CPU, and shapes.
 
     Parameters
     ----------
@@ -237,14 +252,14 @@ def whole_body(
         return kinematics.to(torch.float64, "cpu"), {}
     config = kinematics.config() | {"dtype": "float64"}
     urdf = read_urdf(config["urdf"])
-    held = _held_by(urdf, config["base"])
+    held = _links_on(urdf, config["base"])
     shapes = {link: s for link, s in link_shapes(urdf, meshes).items() if link in held}
     config["links"] += [link for link in shapes if link not in kinematics.links]
     return Robot.from_config(config), shapes
 
 
-def _held_by(urdf: UrdfModel, base: str) -> set[str]:
-    """Links between which and the base there is no joint of several degrees of freedom."""
+def _links_on(urdf: UrdfModel, base: str) -> set[str]:
+    """Return links between which and the base no joint has several degrees of freedom."""
     held, front = {base}, [base]
     joints = [joint for joint in urdf.joints if FREEDOMS[joint.type] <= 1]
     while front:
@@ -257,7 +272,7 @@ def _held_by(urdf: UrdfModel, base: str) -> set[str]:
 
 
 def unit_ball() -> tuple[Array, Array]:
-    """Vertices (V, 3) and triangles (F, 3) of a ball of radius 1."""
+    """Return vertices (V, 3) and triangles (F, 3) of a ball of radius 1."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=2)
@@ -265,7 +280,7 @@ def unit_ball() -> tuple[Array, Array]:
 
 
 def mesh(shape: Shape) -> tuple[Array, Array]:
-    """Vertices (V, 3) [m] and triangles (F, 3) of a ``shape`` that is a mesh.
+    """Return vertices (V, 3) [m] and triangles (F, 3) of a ``shape`` that is a mesh.
 
     Of the formats, COLLADA alone says in which unit its numbers are.
 
