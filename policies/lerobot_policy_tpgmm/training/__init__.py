@@ -1,1 +1,0 @@
-"""Training by ``lerobot-train``: demonstrations gathered, losses reported, the model fitted."""
