@@ -248,8 +248,7 @@ class TPGMMConfig(StatePolicyConfig):
         for names in (self.links, self.state_names, self.action_names, self.environment_names):
             if not all(isinstance(name, str) for name in names or ()):
                 raise DataError(f"names are texts, got {names}")
-        features = {**(self.input_features or {}), **(self.output_features or {})}
-        for name, feature in features.items():
+        for name, feature in self._list_features().items():
             if not all(type(size) is int and 0 < size <= 10**6 for size in feature.shape):
                 raise DataError(
                     f"the shape of {name} is of sizes from 1 to a million, got {feature.shape}"
@@ -260,8 +259,12 @@ class TPGMMConfig(StatePolicyConfig):
                 f"got {self.normalization_mapping}"
             )
 
+    def _list_features(self) -> dict[str, PolicyFeature]:
+        """Return the features of observations and actions."""
+        return {**(self.input_features or {}), **(self.output_features or {})}
+
     def choices(self) -> Choices:
-        """Return the structure that is found in the demonstrations, and what a fit is made of."""
+        """Return what of the structure is found in the demonstrations."""
         parts, found = parse_parts(self.parts), self.operators == ["auto"]
         return Choices(found, self.n_components == "auto", parts, self.modes)
 
@@ -332,7 +335,7 @@ class TPGMMConfig(StatePolicyConfig):
         needed = {OBS_STATE: self.robot_state_feature, ACTION: self.action_feature}
         for key, feature in needed.items():
             if feature is None:
-                there = sorted({**(self.input_features or {}), **(self.output_features or {})})
+                there = sorted(self._list_features())
                 raise DataError(f"a tpgmm policy needs {key}; there are {there}")
 
     def get_optimizer_preset(self) -> AdamConfig:

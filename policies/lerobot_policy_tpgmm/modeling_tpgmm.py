@@ -26,6 +26,7 @@ from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
     JointFeatures,
     check_rate,
+    list_missing,
     list_placed,
     select_observed,
 )
@@ -158,7 +159,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.validate_features()
         cell = open_cell(config)
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
-        if isinstance(model, TaskParameterizedGMM):
+        # where structure was found, the configuration says what was asked for, not what it is
+        if isinstance(model, TaskParameterizedGMM) and config.choices() == Choices():
             self._model = self._apply_overrides(model)
         self.joints = self._match_joints(cell, dataset_meta)
         if dataset_meta is not None and isinstance(self.kinematics, Robot):
@@ -167,18 +169,24 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         names = select_observed(config, required, summary)
         self.frames = self._locate_frames(names, config.frames)
         self.watch = make_watch(cell, self.kinematics, self.frames)
-        self._learner: Learner | None = None
+        self._learner = None
         if dataset_meta is not None:
-            recorded = [name for name in required if name not in config.training.link_frames]
-            places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
-            self._learner = Learner(
-                config, self.kinematics, operators, self.joints,
-                self._locate_frames(recorded, places), dataset_meta, self._model,
-            )  # fmt: skip
+            self._learner = self._make_learner(operators, required, dataset_meta)
         self.reset()
 
+    def _make_learner(
+        self, operators: Sequence[Operator], required: Sequence[str], dataset_meta: Any
+    ) -> Learner:
+        """Return a learner, which sees the frames that the data set has recorded."""
+        config, at_links = self.config, self.config.training.link_frames
+        recorded = [name for name in required if name not in at_links]
+        places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
+        frames = self._locate_frames(recorded, places)
+        signals = self.joints, frames, dataset_meta
+        return Learner(config, self.kinematics, operators, *signals, self._model)
+
     def _handle_removed_options(self) -> None:
-        """Refuse to train with options of release 0.3; a policy that was saved with them runs."""
+        """Refuse to train with options of release 0.3; a policy saved with them runs."""
         if names := ", ".join(self.config.training.clear_removed_options()):
             said = f"{names}: lerobot-train fits by EM alone since 0.4, without gradient steps"
             if self._model is None:
@@ -261,9 +269,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _apply_overrides(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
         """Return the model with the configuration's settings; what cannot change is refused."""
-        config, given = self.config, self.config.given_holds()
-        if config.choices() != Choices():  # what was found is not what was asked for
-            return model
+        config = self.config
         asked = config.decoded_operators()
         there = list(map(format_operator, model.operators_))  # which has no mean paths
         changed = {
@@ -276,12 +282,16 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"which has {len(model.weights_)} components and the operators {there}: fit "
                 "again to change them"
             )
-        if (
-            given in (None, tuple(model.holds_))
-            and FusionConfig.from_fusion(model.skill.fusion) == config.fusion
-            and config.em.covariance_shrinkage == model.covariance_shrinkage
-            and config.em.dtype == model.dtype
-        ):
+        given = config.given_holds()
+        settings = {
+            "fusion": FusionConfig.from_fusion(model.skill.fusion) != config.fusion,
+            "holds": given not in (None, tuple(model.holds_)),
+            "em.covariance_shrinkage": (
+                config.em.covariance_shrinkage != model.covariance_shrinkage
+            ),
+            "em.dtype": config.em.dtype != model.dtype,
+        }
+        if not any(settings.values()):
             return model
         return TaskParameterizedGMM.from_parameters(
             model.weights_,
@@ -342,32 +352,17 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
         settings: dict[str, Any] = {"device": "cpu", "push_to_hub": False, "fps": fps}
         if isinstance(model, TaskParameterizedGMM):
-            settings |= {
-                "em": _settings(model),
-                "fusion": FusionConfig.from_fusion(skill.fusion),
-            }
-            settings["n_components"] = len(model.weights_)
+            settings |= _settings(model)
         config = TPGMMConfig(**(settings | options))
         tensors: dict[str, Tensor] = {}
         model = decode(encode(model, tensors), (), tensors)  # what no file can hold is refused
-        kinematics = skill.kinematics
-        config.state_names = list(state_names or kinematics.joint_names)
-        config.action_names = list(action_names or kinematics.joint_names)
-        config.environment_names = list(environment_names) if environment_names else None
-        config.frames = {k: list(v) for k, v in frames.items()} if frames else None
+        config.state_names = list(state_names or skill.kinematics.joint_names)
+        config.action_names = list(action_names or skill.kinematics.joint_names)
+        config.environment_names = list(environment_names or ()) or None
+        config.frames = {k: list(v) for k, v in (frames or {}).items()} or None
         seen = select_observed(config, skill.frame_names, skill.summary)
         poses = FrameFeatures(seen, config.frames, environment_names, config.state_names, None)
-        given = frames or {}
-        order = [name for name in poses.in_environment if name not in given]
-        if len(order) > 1 and not environment_names:
-            warnings.warn(
-                f"nothing says which entries of {OBS_ENV_STATE} belong to which object: they "
-                f"are read as the poses of {order}, in the order in which the operators name "
-                "them. Say it by environment_names, the names of the entries in the data set "
-                "('bottle.x', ..., 'bottle.qz'), or by frames",
-                PlausibilityWarning,
-                stacklevel=2,
-            )
+        _warn_of_order(config, list_missing(poses.in_environment, config.frames or ()))
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
         return cls(config, model=model).eval().to(config.device)
@@ -767,9 +762,23 @@ def _skill(model: Any) -> Any:
     return model.skill if isinstance(model, TaskParameterizedGMM) else model
 
 
-def _settings(model: TaskParameterizedGMM) -> EMConfig:
-    """Return the settings with which a model was learned; a policy has no generator of its own."""
-    settings = {each.name: getattr(model, each.name) for each in fields(EMConfig)}
-    if not isinstance(settings["random_state"], int):
-        settings["random_state"] = None
-    return EMConfig(**settings)
+def _settings(model: TaskParameterizedGMM) -> dict[str, Any]:
+    """Return the settings of a model for a configuration, which has no random generator."""
+    em = {field.name: getattr(model, field.name) for field in fields(EMConfig)}
+    if not isinstance(em["random_state"], int):
+        em["random_state"] = None
+    fusion = FusionConfig.from_fusion(model.skill.fusion)
+    return {"em": EMConfig(**em), "fusion": fusion, "n_components": len(model.weights_)}
+
+
+def _warn_of_order(config: TPGMMConfig, frames: Sequence[str]) -> None:
+    """Warn if only the order of the operators says which pose is which object's."""
+    if len(frames) > 1 and not config.environment_names:
+        warnings.warn(
+            f"nothing says which entries of {OBS_ENV_STATE} belong to which object: they "
+            f"are read as the poses of {list(frames)}, in the order in which the operators "
+            "name them. Say it by environment_names, the names of the entries in the data set "
+            "('bottle.x', ..., 'bottle.qz'), or by frames",
+            PlausibilityWarning,
+            stacklevel=3,
+        )

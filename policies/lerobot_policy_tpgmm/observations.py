@@ -7,7 +7,8 @@ found by name, and values converted both ways; the model works in radians and me
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -88,7 +89,7 @@ class JointFeatures(nn.Module):
         self.state_names, self.action_names = tuple(state_names), tuple(action_names)
         in_state = match_names(joint_names, state_names, OBS_STATE, REMEDY)
         in_action = match_names(joint_names, action_names, ACTION, REMEDY)
-        if extra := [name for name in action_names if name not in in_action]:
+        if extra := list_missing(action_names, in_action):
             raise DataError(
                 f"the action has the entries {extra}, which are no joints of the model; it has "
                 f"{list(joint_names)}. Learn them too (--policy.joints; what moves no link of "
@@ -96,18 +97,17 @@ class JointFeatures(nn.Module):
                 "them: tpgmm dataset convert SET NEW --robot ROBOT --robot-joint PATTERN"
             )
         entry = {joint: name for name, joint in in_state.items()}
-        called = [in_state.get(name, name) for name in state_names]
-        called += [in_action[name] for name in action_names]
+        called = [*(in_state.get(name, name) for name in state_names)]
+        called += map(in_action.__getitem__, action_names)
         every = *state_names, *action_names
         chosen = units_of(_parse_units(units), every, called, robot, OBS_STATE)
-        self.raw = {name for name, unit in zip(called, chosen, strict=True) if unit == "raw"}
-        scales = torch.tensor(
-            [
-                _add_offset(as_scale(unit, name), offsets.get(joint, offsets.get(name, 0)))
-                for name, joint, unit in zip(every, called, chosen, strict=True)
-            ],
-            dtype=torch.float64,
-        )
+        units_by_name = list(zip(every, called, chosen, strict=True))
+        self.raw = {joint for _, joint, unit in units_by_name if unit == "raw"}
+        rows = [
+            _add_offset(as_scale(unit, name), offsets.get(joint, offsets.get(name, 0)))
+            for name, joint, unit in units_by_name
+        ]
+        scales = torch.tensor(rows, dtype=torch.float64)
         columns = torch.tensor([every.index(entry[joint]) for joint in joint_names])
         order = torch.tensor([self.joint_names.index(in_action[n]) for n in action_names])
         # they follow from the configuration: not in the file
@@ -167,9 +167,8 @@ class FrameFeatures:
         default: Sequence[float] | None,
         n_environment: int | None = None,
     ) -> None:
-        for name in places or {}:
-            if name not in frame_names:
-                raise UnknownNameError("frame", name, "the model", frame_names)
+        if unknown := list_missing(places or (), frame_names):
+            raise UnknownNameError("frame", unknown[0], "the model", frame_names)
         named, stated = find_poses(environment_names), find_poses(state_names)
         if not environment_names:  # then they follow one another
             named = {n: [*range(POSE * i, POSE * (i + 1))] for i, n in enumerate(frame_names)}
@@ -177,22 +176,30 @@ class FrameFeatures:
             named.pop(name, None)
             columns, in_state = _find_columns(name, place, environment_names, state_names)
             (stated if in_state else named)[name] = columns
-        self.in_environment = {name: named[name] for name in frame_names if name in named}
-        self.in_state = {name: stated[name] for name in frame_names if name in stated}
         self.frame_names = tuple(frame_names)
-        least = 1 + max((max(p) for p in self.in_environment.values()), default=-1)
+        self.in_environment = self._keep(named)
+        self.in_state = self._keep(stated)
+        least = 1 + max(chain(*self.in_environment.values()), default=-1)
         self.n_environment = len(environment_names or ()) or n_environment or least
         if self.n_environment < least:
             raise ShapeError(
                 f"{OBS_ENV_STATE} has {self.n_environment} entries, the frames "
                 f"{list(frame_names)} are at {self.in_environment}"
             )
-        self.default = None if default is None else torch.tensor(default, dtype=torch.float64)
-        if self.default is not None and len(self.default) != self.n_environment:
+        self.default = None if default is None else self._make_default(default)
+
+    def _keep(self, found: Mapping[str, list[int]]) -> dict[str, list[int]]:
+        """Keep the columns of the frames that the model needs."""
+        return {name: found[name] for name in self.frame_names if name in found}
+
+    def _make_default(self, default: Sequence[float]) -> Tensor:
+        """Return a whole state of the environment, of the right size."""
+        if len(default) != self.n_environment:
             raise ShapeError(
-                f"default_environment_state has {len(self.default)} values, "
+                f"default_environment_state has {len(default)} values, "
                 f"{OBS_ENV_STATE} has {self.n_environment}"
             )
+        return torch.tensor(default, dtype=torch.float64)
 
     def frames(self, batch: Mapping[str, Any]) -> dict[str, Frame]:
         """Return the poses (B,) of all frames.
@@ -233,7 +240,7 @@ class FrameFeatures:
         return {**batch, OBS_ENV_STATE: environment.to(batch[OBS_STATE].device)}
 
     def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
-        """Return poses (B, 7) in the middle of an episode, of any values; None for a lost one."""
+        """Return poses (B, 7) of any values, within an episode; None for a lost one."""
         state, environment = batch[OBS_STATE], batch.get(OBS_ENV_STATE)
         poses: dict[str, Tensor | None] = {}
         for name in self.frame_names:
@@ -286,6 +293,11 @@ def select_observed(
     return [name for name in required if name not in start or name in placed]
 
 
+def list_missing(names: Iterable[str], known: Container[str]) -> list[str]:
+    """Return the names that are not known."""
+    return [name for name in names if name not in known]
+
+
 def _add_offset(scale: Scale, offset: float) -> tuple[float, float]:
     """Return factor and offset of a unit, shifted."""
     return scale.factor, scale.offset + offset
@@ -305,7 +317,7 @@ def _parse_units(units: Any) -> Units:
 
 
 def find_poses(names: Sequence[str] | None) -> dict[str, list[int]]:
-    """Return the positions of poses that names tell of; LeRobot puts ``.pos`` behind the names of robots."""
+    """Return the positions of poses that names tell of; LeRobot puts ``.pos`` behind."""
     plain = [name.removesuffix(".pos") for name in names or ()]
     return {name: list(group) for name, group in pose_groups(plain).items()}
 
@@ -322,7 +334,7 @@ def _find_columns(
     if all(isinstance(entry, int) and entry >= 0 for entry in place):
         return [int(entry) for entry in place], False
     for in_state, names in ((False, environment_names or ()), (True, state_names)):
-        if all(entry in names for entry in place):
+        if set(place) <= set(names):
             return [list(names).index(str(entry)) for entry in place], in_state
     raise DataError(
         f"frame {name!r} is at {list(place)}, which are not all entries of {OBS_ENV_STATE}, "

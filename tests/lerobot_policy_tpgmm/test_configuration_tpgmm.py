@@ -87,7 +87,6 @@ def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):
         ("clock", "sundial"),
         ("joint_timeout", 0.0),
         ("feedback", "velocity"),
-        ("loss", "hinge"),
         ("alignment", "guess"),
         ("form", "sum"),
         ("n_components", 0),

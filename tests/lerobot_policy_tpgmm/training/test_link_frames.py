@@ -91,16 +91,6 @@ def test_operators_that_nobody_names_see_the_frames_too(grips):
     assert {"start", "bottle"} <= {*poses.references()}
 
 
-def test_more_steps_change_nothing_and_say_so(policy, grips, caplog):
-    learner = fresh(grips, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
-    for batch in epoch(grips, 32):
-        learner.forward(batch)
-    with caplog.at_level("WARNING"):
-        loss, _ = learner.forward(epoch(grips, 32)[0])
-    assert loss.item() == 0
-    assert "frames are at events, l_hand@close, l_hand@start" in caplog.text
-
-
 def test_episodes_without_the_event_are_named(tmp_path):
     data = dataset(written(tmp_path / "set", (2.0, None, 1.8, None)))
     learner = fresh(data, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)

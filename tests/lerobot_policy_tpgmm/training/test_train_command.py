@@ -57,12 +57,12 @@ def saved(folder, step: int, output: str = "out") -> TPGMMPolicy:
 
 @pytest.fixture(scope="module")
 def log(folder, n_steps):
-    """The first epoch, then as many steps by gradient; checkpoints and losses after both."""
+    """An epoch and a step more; checkpoints and losses of held-out frames after both."""
     return train(
         folder, "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
-        f"--policy.n_components={K}", "--policy.training.loss=imitation", "--num_workers=0",
+        f"--policy.n_components={K}", "--num_workers=0",
         "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
-        "--dataset.eval_split=0.2", f"--batch_size={BATCH}", f"--steps={2 * n_steps}",
+        "--dataset.eval_split=0.2", f"--batch_size={BATCH}", f"--steps={n_steps + 1}",
         f"--save_freq={n_steps}", f"--eval_steps={n_steps}", f"--output_dir={folder / 'out'}",
     )  # fmt: skip
 
@@ -79,31 +79,29 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     frames = sum(map(len, learned))
     for said in (f"{frames} frames of 4 episodes collected", f"{K} components fitted by"):
         assert said in log
-    assert logged(log, "loss")[:n_steps] == [0.0] * n_steps
+    assert set(logged(log, "loss")) == set(logged(log, "eval_loss")) == {0.0}
 
 
-def test_then_the_loss_falls_by_gradient(folder, log, n_steps):
-    losses = logged(log, "loss")[n_steps:]
-    assert len(losses) == n_steps and min(losses) > 0
-    before, after = logged(log, "eval_loss")
-    assert after < before
-    fitted, trained = (saved(folder, step).to_estimator() for step in (n_steps, 2 * n_steps))
-    change = (trained.means_[0] - fitted.means_[0]).abs().max()
-    assert 1e-4 < change < 1e-4 * 1.01 * n_steps  # Adam's steps are of the size optimizer_lr
-
-
-def test_a_run_is_resumed(folder, log, n_steps):
-    end = 2 * n_steps + n_steps + 2
+def test_more_steps_and_a_resumed_run_change_nothing(folder, log, n_steps):
+    assert log.count("more steps change nothing") == 1
+    end = n_steps + 3
     checkpoint = folder / "out" / "checkpoints" / "last" / "pretrained_model"
     resumed = train(
         folder, f"--config_path={checkpoint / 'train_config.json'}", "--resume=true",
         f"--steps={end}", "--eval_steps=1",
     )  # fmt: skip
-    losses = logged(resumed, "loss")
-    # the frames are collected anew, which changes nothing, and then it goes on
-    assert losses[:n_steps] == [0.0] * n_steps and min(losses[n_steps:]) > 0
-    held_out = logged(resumed, "eval_loss")
-    assert set(held_out[:n_steps]) == {logged(log, "eval_loss")[-1]}
-    assert held_out[-1] < held_out[0]
-    assert "components fitted" not in resumed
-    saved(folder, end)
+    assert set(logged(resumed, "loss")) == set(logged(resumed, "eval_loss")) == {0.0}
+    assert "more steps change nothing" in resumed and "components fitted" not in resumed
+    fitted = saved(folder, n_steps).to_estimator()
+    for step in (n_steps + 1, end):
+        same(saved(folder, step).to_estimator(), fitted, 0)
+
+
+def test_options_that_went_are_refused_in_words(folder):
+    done = lerobot(
+        "train", "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
+        "--policy.training.loss=imitation", "--num_workers=0", "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
+        f"--output_dir={folder / 'refused'}", home=folder,
+    )  # fmt: skip
+    assert done.returncode and "--policy.training.loss: lerobot-train fits by EM" in done.stderr
