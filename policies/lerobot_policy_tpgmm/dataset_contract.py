@@ -152,7 +152,7 @@ def _check_names(config: TPGMMConfig, kinematics: Kinematics) -> None:
 def read_declared(
     config: TPGMMConfig, features: Mapping[str, Any], what: str
 ) -> dict[str, Any]:
-    """Return units or offsets by name, where the data set (of this project's writer) declares them."""
+    """Return units or offsets by name, where the data set (of our writer) declares them."""
     found: dict[str, Any] = {}
     for key in (OBS_STATE, ACTION):
         values = (features.get(key, {}).get("info") or {}).get(what)

@@ -343,17 +343,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             If names or frames do not fit the model, or it holds an operator or a robot of
             your own, which a file cannot describe.
         """
-        skill = _skill(model)
-        try:
-            time = skill.time
-        except AttributeError:
-            raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
-        if fps is None and len(time) > 1:
-            fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        settings: dict[str, Any] = {"device": "cpu", "push_to_hub": False, "fps": fps}
-        if isinstance(model, TaskParameterizedGMM):
-            settings |= _settings(model)
+        settings = {"device": "cpu", "push_to_hub": False, **_settings(model)}
+        if fps is not None:
+            settings["fps"] = fps
         config = TPGMMConfig(**(settings | options))
+        skill = _skill(model)
         tensors: dict[str, Tensor] = {}
         model = decode(encode(model, tensors), (), tensors)  # what no file can hold is refused
         config.state_names = list(state_names or skill.kinematics.joint_names)
@@ -762,13 +756,21 @@ def _skill(model: Any) -> Any:
     return model.skill if isinstance(model, TaskParameterizedGMM) else model
 
 
-def _settings(model: TaskParameterizedGMM) -> dict[str, Any]:
-    """Return the settings of a model for a configuration, which has no random generator."""
-    em = {field.name: getattr(model, field.name) for field in fields(EMConfig)}
-    if not isinstance(em["random_state"], int):
-        em["random_state"] = None
-    fusion = FusionConfig.from_fusion(model.skill.fusion)
-    return {"em": EMConfig(**em), "fusion": fusion, "n_components": len(model.weights_)}
+def _settings(model: Any) -> dict[str, Any]:
+    """Return the settings of a model or skill for a configuration."""
+    try:
+        time = _skill(model).time
+    except AttributeError:
+        raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
+    rate = round(float((len(time) - 1) / (time[-1] - time[0])), 6) if len(time) > 1 else None
+    settings: dict[str, Any] = {"fps": rate}
+    if isinstance(model, TaskParameterizedGMM):
+        em = {field.name: getattr(model, field.name) for field in fields(EMConfig)}
+        if not isinstance(em["random_state"], int):  # a configuration has no generator
+            em["random_state"] = None
+        settings |= {"em": EMConfig(**em), "n_components": len(model.weights_)}
+        settings["fusion"] = FusionConfig.from_fusion(model.skill.fusion)
+    return settings
 
 
 def _warn_of_order(config: TPGMMConfig, frames: Sequence[str]) -> None:

@@ -167,30 +167,36 @@ class FrameFeatures:
         default: Sequence[float] | None,
         n_environment: int | None = None,
     ) -> None:
-        if unknown := list_missing(places or (), frame_names):
+        places, environment_names = places or {}, environment_names or ()
+        if unknown := list_missing(places, frame_names):
             raise UnknownNameError("frame", unknown[0], "the model", frame_names)
         named, stated = find_poses(environment_names), find_poses(state_names)
         if not environment_names:  # then they follow one another
-            named = {n: [*range(POSE * i, POSE * (i + 1))] for i, n in enumerate(frame_names)}
-        for name, place in (places or {}).items():
+            starts = range(0, POSE * len(frame_names), POSE)
+            named = {n: [*range(i, i + POSE)] for n, i in zip(frame_names, starts, strict=True)}
+        for name, place in places.items():
             named.pop(name, None)
             columns, in_state = _find_columns(name, place, environment_names, state_names)
             (stated if in_state else named)[name] = columns
         self.frame_names = tuple(frame_names)
         self.in_environment = self._keep(named)
         self.in_state = self._keep(stated)
-        least = 1 + max(chain(*self.in_environment.values()), default=-1)
-        self.n_environment = len(environment_names or ()) or n_environment or least
-        if self.n_environment < least:
-            raise ShapeError(
-                f"{OBS_ENV_STATE} has {self.n_environment} entries, the frames "
-                f"{list(frame_names)} are at {self.in_environment}"
-            )
+        self.n_environment = self._count_entries(len(environment_names) or n_environment)
         self.default = None if default is None else self._make_default(default)
 
     def _keep(self, found: Mapping[str, list[int]]) -> dict[str, list[int]]:
         """Keep the columns of the frames that the model needs."""
         return {name: found[name] for name in self.frame_names if name in found}
+
+    def _count_entries(self, given: int | None) -> int:
+        """Return the size of the environment's state, if not given that of its frames."""
+        least = 1 + max(chain(*self.in_environment.values()), default=-1)
+        if given and given < least:
+            raise ShapeError(
+                f"{OBS_ENV_STATE} has {given} entries, the frames {list(self.frame_names)} are "
+                f"at {self.in_environment}"
+            )
+        return given or least
 
     def _make_default(self, default: Sequence[float]) -> Tensor:
         """Return a whole state of the environment, of the right size."""
@@ -325,7 +331,7 @@ def find_poses(names: Sequence[str] | None) -> dict[str, list[int]]:
 def _find_columns(
     name: str,
     place: Sequence[int | str],
-    environment_names: Sequence[str] | None,
+    environment_names: Sequence[str],
     state_names: Sequence[str],
 ) -> tuple[list[int], bool]:
     """Return the columns of a pose, and whether they are of the robot's state."""
@@ -333,12 +339,12 @@ def _find_columns(
         raise DataError(f"frame {name!r} is at seven entries, x y z qw qx qy qz; got {place}")
     if all(isinstance(entry, int) and entry >= 0 for entry in place):
         return [int(entry) for entry in place], False
-    for in_state, names in ((False, environment_names or ()), (True, state_names)):
+    for in_state, names in ((False, environment_names), (True, state_names)):
         if set(place) <= set(names):
             return [list(names).index(str(entry)) for entry in place], in_state
     raise DataError(
         f"frame {name!r} is at {list(place)}, which are not all entries of {OBS_ENV_STATE}, "
-        f"{list(environment_names or ())}, nor of {OBS_STATE}, {list(state_names)}"
+        f"{list(environment_names)}, nor of {OBS_STATE}, {list(state_names)}"
     )
 
 

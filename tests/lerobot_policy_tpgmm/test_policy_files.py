@@ -110,7 +110,8 @@ def test_a_policy_of_release_0_3_with_options_of_gradient_steps_runs(directory, 
     assert torch.equal(act(old, batch(), 5), act(fitted(), batch(), 5))
     old.save_pretrained(directory)
     caplog.clear()
-    assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
+    again = TPGMMPolicy.from_pretrained(directory)
+    assert again.config.training == fitted().config.training
     assert "optimizer_lr" not in caplog.text
 
 
