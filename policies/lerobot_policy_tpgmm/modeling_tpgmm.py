@@ -758,8 +758,9 @@ def _skill(model: Any) -> Any:
 
 def _settings(model: Any) -> dict[str, Any]:
     """Return the settings of a model or skill for a configuration."""
+    skill = _skill(model)
     try:
-        time = _skill(model).time
+        time = skill.time
     except AttributeError:
         raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
     rate = round(float((len(time) - 1) / (time[-1] - time[0])), 6) if len(time) > 1 else None
