@@ -46,11 +46,11 @@ def train(folder, *arguments: str) -> str:
     return done.stderr
 
 
-def logged(log: str, name: str) -> list[float]:
+def read_figures(log: str, name: str) -> list[float]:
     return [float(value) for value in re.findall(rf"\b{name}[:=](-?[\d.]+|nan|inf)", log)]
 
 
-def saved(folder, step: int, output: str = "out") -> TPGMMPolicy:
+def load_checkpoint(folder, step: int, output: str = "out") -> TPGMMPolicy:
     checkpoint = folder / output / "checkpoints" / f"{step:06d}"
     return TPGMMPolicy.from_pretrained(checkpoint / "pretrained_model")
 
@@ -71,7 +71,7 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     learned, held_out = demonstrations[:4], demonstrations[4:]
     aligned = DynamicTimeWarping(robot=upper_body()).fit_transform(learned)
     model = TaskParameterizedGMM(K, bottle_operators(), upper_body()).fit(aligned)
-    policy = saved(folder, n_steps)
+    policy = load_checkpoint(folder, n_steps)
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(held_out) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-5)
@@ -79,7 +79,7 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     frames = sum(map(len, learned))
     for said in (f"{frames} frames of 4 episodes collected", f"{K} components fitted by"):
         assert said in log
-    assert set(logged(log, "loss")) == set(logged(log, "eval_loss")) == {0.0}
+    assert set(read_figures(log, "loss")) == set(read_figures(log, "eval_loss")) == {0.0}
 
 
 def test_more_steps_and_a_resumed_run_change_nothing(folder, log, n_steps):
@@ -90,11 +90,13 @@ def test_more_steps_and_a_resumed_run_change_nothing(folder, log, n_steps):
         folder, f"--config_path={checkpoint / 'train_config.json'}", "--resume=true",
         f"--steps={end}", "--eval_steps=1",
     )  # fmt: skip
-    assert set(logged(resumed, "loss")) == set(logged(resumed, "eval_loss")) == {0.0}
+    assert (
+        set(read_figures(resumed, "loss")) == set(read_figures(resumed, "eval_loss")) == {0.0}
+    )
     assert "more steps change nothing" in resumed and "components fitted" not in resumed
-    fitted = saved(folder, n_steps).to_estimator()
+    fitted = load_checkpoint(folder, n_steps).to_estimator()
     for step in (n_steps + 1, end):
-        same(saved(folder, step).to_estimator(), fitted, 0)
+        same(load_checkpoint(folder, step).to_estimator(), fitted, 0)
 
 
 def test_options_that_went_are_refused_in_words(folder):
