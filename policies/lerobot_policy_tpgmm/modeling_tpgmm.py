@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, read_declared
 from lerobot_policy_tpgmm.eyes import make_watch, open_cell, take_over
-from lerobot_policy_tpgmm.learner import Learner
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
     JointFeatures,
@@ -33,6 +32,7 @@ from lerobot_policy_tpgmm.observations import (
 from lerobot_policy_tpgmm.policy_files import PATTERNS, read_model, write_files
 from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
+from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_control.loop.command import Command, Status
 from tpgmm_control.loop.controller import Controller
 from tpgmm_control.obstacles import Scene
@@ -614,7 +614,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.joints.joints(batch[OBS_STATE])
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
-        """Learn a batch of a data set; see :mod:`lerobot_policy_tpgmm.learner`.
+        """Learn a batch of a data set; see :mod:`lerobot_policy_tpgmm.training.learner`.
 
         Parameters
         ----------

@@ -18,8 +18,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, distributed
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
-from lerobot_policy_tpgmm.epoch_recorder import EpochRecorder, episode_ranges
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
+from lerobot_policy_tpgmm.training.epoch_recorder import EpochRecorder, episode_ranges
 from tpgmm_datasets import check
 from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events

@@ -1,0 +1,1 @@
+"""Training by ``lerobot-train``: demonstrations gathered, and the model fitted."""
