@@ -52,7 +52,7 @@ class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
     )
 
     def get_scheduler_preset(self) -> None:
-        """No schedule."""
+        """Return no schedule."""
 
     @property
     def observation_delta_indices(self) -> None:
@@ -70,7 +70,7 @@ class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
 def state_features(
     n_state: int, n_environment: int, n_action: int
 ) -> dict[str, dict[str, PolicyFeature]]:
-    """``input_features`` and ``output_features`` of a policy on states of such sizes.
+    """Return ``input_features`` and ``output_features`` of a policy on states of such sizes.
 
     There is no ``observation.environment_state`` where it has no entries.
     """
@@ -220,29 +220,8 @@ class TPGMMConfig(StatePolicyConfig):
             raise
 
     def _check(self) -> None:
-        rates = {"fps": self.fps, "control_fps": self.control_fps}
-        rates["control.largest_start_gap"] = self.control.largest_start_gap
-        for name, value in rates.items():
-            if value is not None and not 0 < value < math.inf:
-                raise DataError(f"{name} is a positive number or null, got {value}")
-        for names in (self.links, self.state_names, self.action_names, self.environment_names):
-            if not all(isinstance(name, str) for name in names or ()):
-                raise DataError(f"names are texts, got {names}")
-        for name, one in {
-            **(self.input_features or {}),
-            **(self.output_features or {}),
-        }.items():
-            if not all(type(size) is int and 0 < size <= 10**6 for size in one.shape):
-                raise DataError(
-                    f"the shape of {name} is of sizes from 1 to a million, got {one.shape}"
-                )
-        if self.chunk_size < 1:
-            raise DataError(f"chunk_size is at least 1, got {self.chunk_size}")
-        if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
-            raise DataError(
-                "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
-                f"got {self.normalization_mapping}"
-            )
+        self._check_numbers()
+        self._check_features()
         self.training.check()
         self.link_poses()
         for text in self.training.events.values():
@@ -254,8 +233,38 @@ class TPGMMConfig(StatePolicyConfig):
         check_parameters(model)
         check_parameters(SelectWays(model, self.modes))
 
+    def _check_numbers(self) -> None:
+        """Refuse rates and sizes that are out of range."""
+        rates = {"fps": self.fps, "control_fps": self.control_fps}
+        rates["control.largest_start_gap"] = self.control.largest_start_gap
+        for name, value in rates.items():
+            if value is not None and not 0 < value < math.inf:
+                raise DataError(f"{name} is a positive number or null, got {value}")
+        if self.chunk_size < 1:
+            raise DataError(f"chunk_size is at least 1, got {self.chunk_size}")
+
+    def _check_features(self) -> None:
+        """Refuse names, shapes and normalisations that no feature has."""
+        for names in (self.links, self.state_names, self.action_names, self.environment_names):
+            if not all(isinstance(name, str) for name in names or ()):
+                raise DataError(f"names are texts, got {names}")
+        for name, feature in self._list_features().items():
+            if not all(type(size) is int and 0 < size <= 10**6 for size in feature.shape):
+                raise DataError(
+                    f"the shape of {name} is of sizes from 1 to a million, got {feature.shape}"
+                )
+        if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
+            raise DataError(
+                "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
+                f"got {self.normalization_mapping}"
+            )
+
+    def _list_features(self) -> dict[str, PolicyFeature]:
+        """Return the features of observations and actions."""
+        return {**(self.input_features or {}), **(self.output_features or {})}
+
     def choices(self) -> Choices:
-        """Structure that is found in the demonstrations, and what a fit is made of."""
+        """Return what of the structure is found in the demonstrations."""
         parts, found = parse_parts(self.parts), self.operators == ["auto"]
         return Choices(found, self.n_components == "auto", parts, self.modes)
 
@@ -274,11 +283,11 @@ class TPGMMConfig(StatePolicyConfig):
         return rate
 
     def link_poses(self) -> dict[str, LinkPose]:
-        """Link poses that ``link_frames`` stands for."""
+        """Return the link poses that ``link_frames`` stands for."""
         return {name: LinkPose.parse(text) for name, text in self.training.link_frames.items()}
 
     def kinematics(self) -> Kinematics | None:
-        """The robot that ``robot`` describes, None for joints alone."""
+        """Return the robot that ``robot`` describes, None for joints alone."""
         if self.robot is None or isinstance(self.robot, dict):
             return None if self.robot is None else decode(self.robot)
         joints = self.joints
@@ -288,7 +297,7 @@ class TPGMMConfig(StatePolicyConfig):
         return parse_robot(self.robot, self.links, **settings)
 
     def decoded_operators(self) -> list[Operator] | None:
-        """The operators that ``operators`` describes; None if they are not given.
+        """Return the operators that ``operators`` describes; None if they are not given.
 
         Raises
         ------
@@ -308,17 +317,17 @@ class TPGMMConfig(StatePolicyConfig):
         ]
 
     def via_operators(self) -> list[Operator]:
-        """Whose coordinates the via-points are."""
+        """Return the operators whose coordinates the via-points are."""
         return [ViaPoint.parse(text).operator for text in self.via_points or ()]
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
-        """An unfitted estimator of these hyper-parameters."""
+        """Make an unfitted estimator of these hyper-parameters."""
         count: Any = 10 if self.n_components == "auto" else self.n_components
         fusion, settings = self.fusion.value(), vars(self.em)
         return TaskParameterizedGMM(count, operators, kinematics, fusion=fusion, **settings)
 
     def given_holds(self) -> tuple[Hold, ...] | None:
-        """Holds that ``holds`` describes; None if they are to be found."""
+        """Return the holds that ``holds`` describes; None if they are to be found."""
         return None if self.holds is None else tuple(map(Hold.parse, self.holds))
 
     def validate_features(self) -> None:
@@ -326,9 +335,9 @@ class TPGMMConfig(StatePolicyConfig):
         needed = {OBS_STATE: self.robot_state_feature, ACTION: self.action_feature}
         for key, feature in needed.items():
             if feature is None:
-                there = sorted({**(self.input_features or {}), **(self.output_features or {})})
+                there = sorted(self._list_features())
                 raise DataError(f"a tpgmm policy needs {key}; there are {there}")
 
     def get_optimizer_preset(self) -> AdamConfig:
-        """Adam, without weight decay."""
-        return AdamConfig(lr=self.training.optimizer_lr, weight_decay=0.0)
+        """Return an optimizer, as ``lerobot-train`` asks for; it has nothing to change."""
+        return AdamConfig(weight_decay=0.0)

@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.eyes import take_over
+from lerobot_policy_tpgmm.observations import is_at_start
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
 from tpgmm_datasets.signals import CELL
@@ -23,7 +24,7 @@ from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.structure.choices import operators_or_default
 
-__all__ = ["adopt", "check_dataset", "declared"]
+__all__ = ["adopt", "check_dataset", "read_declared"]
 
 log = logging.getLogger(__name__)
 
@@ -49,24 +50,14 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     config.fps = float(dataset.fps)
     if (file := Path(dataset.root) / CELL).exists():
         config.cell = take_over(config.cell or str(file), json.loads(read_whole(file)))
-    if config.units is None:
-        config.units = declared(config, dataset.features, "units")
-    elif isinstance(config.units, str) and config.units.endswith(".json"):
-        names = config.state_names or []
-        scales = calibrated_units(config.units, tuple(names))
-        config.units = {name: [scale.factor, scale.offset] for name, scale in scales.items()}
+    _adopt_units(config, dataset)
     config.validate_features()
     config.input_features = {
         key: feature
         for key, feature in (config.input_features or {}).items()
         if key in (OBS_STATE, OBS_ENV_STATE)
     }
-    kinematics = config.kinematics()
-    if kinematics is None:
-        size = dataset.features[OBS_STATE]["shape"][0]
-        kinematics = JointSpace(config.state_names or [f"joint_{i}" for i in range(size)])
-    else:
-        _check_named(config, kinematics)
+    kinematics = _make_kinematics(config, dataset)
     _check_links(config, kinematics)
     given = config.decoded_operators() or ()
     frames = _frames(config, kinematics, given)
@@ -76,15 +67,33 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     return kinematics, operators
 
 
+def _adopt_units(config: TPGMMConfig, dataset: Any) -> None:
+    """Take the units that the data set declares, or those of LeRobot's calibration file."""
+    if config.units is None:
+        config.units = read_declared(config, dataset.features, "units")
+    elif isinstance(config.units, str) and config.units.endswith(".json"):
+        scales = calibrated_units(config.units, tuple(config.state_names or ()))
+        config.units = {name: [scale.factor, scale.offset] for name, scale in scales.items()}
+
+
+def _make_kinematics(config: TPGMMConfig, dataset: Any) -> Kinematics:
+    """Return the robot of the configuration, or the joints alone."""
+    kinematics = config.kinematics()
+    if kinematics is None:
+        size = dataset.features[OBS_STATE]["shape"][0]
+        return JointSpace(config.state_names or [f"joint_{i}" for i in range(size)])
+    _check_names(config, kinematics)
+    return kinematics
+
+
 def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
-    """Whether frames at links can be made, and where they are observed later is clear."""
+    """Refuse frames at links that cannot be made, or are not observed later."""
     for name, pose in config.link_poses().items():
         if pose.link not in kinematics.links:
             raise UnknownNameError(
                 "link", pose.link, f"the robot (frame {name!r})", kinematics.links
             )
-        at_start = pose.event == "start" and pose.offset is None
-        clear = at_start or config.environment_names or not config.frames
+        clear = is_at_start(pose) or config.environment_names or not config.frames
         if not clear and name not in (config.frames or ()):
             raise DataError(
                 f"frame {name!r} is at {config.training.link_frames[name]!r} in the episodes; "
@@ -94,7 +103,7 @@ def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
 
 
 def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
-    """Whether a fitted policy and a data set are about the same signals."""
+    """Refuse a data set of other signals than those of a fitted policy."""
     for key, field in NAMES.items():
         expected, names = getattr(config, field), _names(dataset.features, key)
         if expected and names and list(expected) != names:
@@ -128,7 +137,7 @@ def _names(features: Mapping[str, Any], key: str) -> list[str] | None:
     return None if names is None else list(names)
 
 
-def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
+def _check_names(config: TPGMMConfig, kinematics: Kinematics) -> None:
     """Refuse a robot of several joints whose values have no names."""
     unnamed = {key: f"--policy.{NAMES[key]}='[...]'" for key in (OBS_STATE, ACTION)}
     unnamed = {k: text for k, text in unnamed.items() if getattr(config, NAMES[k]) is None}
@@ -140,8 +149,10 @@ def _check_named(config: TPGMMConfig, kinematics: Kinematics) -> None:
         )
 
 
-def declared(config: TPGMMConfig, features: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """Units or offsets by name, where the data set (of this project's writer) declares them."""
+def read_declared(
+    config: TPGMMConfig, features: Mapping[str, Any], what: str
+) -> dict[str, Any]:
+    """Return units or offsets by name, where the data set (of our writer) declares them."""
     found: dict[str, Any] = {}
     for key in (OBS_STATE, ACTION):
         values = (features.get(key, {}).get("info") or {}).get(what)
@@ -152,7 +163,7 @@ def declared(config: TPGMMConfig, features: Mapping[str, Any], what: str) -> dic
 
 
 def _frames(config: TPGMMConfig, kinematics: Kinematics, given: Sequence[Any]) -> list[str]:
-    """The frames that there are."""
+    """Return the names of the frames that there are."""
     if config.frames:
         return list(dict.fromkeys((*config.frames, *config.training.link_frames)))
     groups = pose_groups(config.environment_names) if config.environment_names else {}

@@ -13,15 +13,15 @@ from lerobot_policy_tpgmm.observations import FrameFeatures
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots import Kinematics, Robot
 
-__all__ = ["opened", "take_over", "watching"]
+__all__ = ["make_watch", "open_cell", "take_over"]
 
 # tpgmm_vision, which needs OpenCV, is imported where there is a cell
 
 log = logging.getLogger(__name__)
 
 
-def opened(config: TPGMMConfig) -> Any:
-    """The cell, if there is one; its content, and the pictures that it needs, are kept."""
+def open_cell(config: TPGMMConfig) -> Any:
+    """Open the cell, if there is one; its content, and the pictures that it needs, are kept."""
     inputs, visual = config.input_features or {}, FeatureType.VISUAL
     config.input_features = {key: one for key, one in inputs.items() if one.type is not visual}
     if config.cell in (None, NO_CELL):
@@ -37,7 +37,7 @@ def opened(config: TPGMMConfig) -> Any:
 
 
 def take_over(given: Any, learned: Mapping[str, Any]) -> dict[str, Any]:
-    """The cell of a policy that was learned with another one; what differs is a warning.
+    """Return the cell of a policy that was learned with another one; warn of what differs.
 
     Parameters
     ----------
@@ -60,8 +60,8 @@ def take_over(given: Any, learned: Mapping[str, Any]) -> dict[str, Any]:
     return dict(cell.content)
 
 
-def watching(cell: Any, robot: Kinematics, frames: FrameFeatures) -> Any:
-    """Source of a policy's frames, if it has a cell with a source of poses."""
+def make_watch(cell: Any, robot: Kinematics, frames: FrameFeatures) -> Any:
+    """Return the source of a policy's frames, if it has a cell with a source of poses."""
     if cell is None or cell.source == NO_CELL:
         return None
     from tpgmm_vision.watching import Watch

@@ -51,7 +51,7 @@ def write_pretrained(model: Any, path: Path, signals: Signals) -> None:
 
 
 def _replaceable(path: Path) -> bool:
-    """Whether it is empty or holds a policy of this type."""
+    """Return True for a folder that is empty or holds a policy of this type."""
     if not path.is_dir():
         return False
     config = path / "config.json"

@@ -16,18 +16,18 @@ from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
-from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, declared
-from lerobot_policy_tpgmm.eyes import opened, take_over, watching
-from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
+from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset, read_declared
+from lerobot_policy_tpgmm.eyes import make_watch, open_cell, take_over
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
     JointFeatures,
     check_rate,
-    observed_frames,
-    poses_named,
+    list_missing,
+    list_placed,
+    select_observed,
 )
 from lerobot_policy_tpgmm.policy_files import PATTERNS, read_model, write_files
 from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
@@ -97,16 +97,16 @@ class Chunk:
     timestamp: float | None
     rate: float
 
-    def passed(
+    def find_last_sent(
         self, measured: Tensor, timestamp: float | None, left_over: Tensor | None
     ) -> int:
-        """The index of the action that was sent last."""
+        """Return the index of the action that was sent last."""
         last = len(self.moments) - 1
         if left_over is not None:
             # rows of zeros fill up what is shorter than LeRobot's horizon
-            same = (self.actions[0] == left_over[:1]).all(-1) if len(left_over) else None
-            if same is None or not bool(left_over.any()):
+            if not bool(left_over.any()):
                 return last
+            same = (self.actions[0] == left_over[:1]).all(-1)
             if bool(same.any()):
                 return max(int(same.nonzero()[-1]) - 1, 0)
         if timestamp is not None and self.timestamp is not None:
@@ -143,8 +143,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     config_class = TPGMMConfig
     name = "tpgmm"
 
-    mixture: MixtureParameters
-
     def __init__(
         self,
         config: TPGMMConfig,
@@ -154,56 +152,94 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         **unused: Any,
     ) -> None:
         super().__init__(config)
-        self.config = config
-        if model is None:
-            kinematics, operators = self._asked(dataset_meta)
-            required = frame_names([*operators, *config.via_operators()], kinematics)
-        else:
-            if dataset_meta is not None:
-                check_dataset(config, dataset_meta)
-            skill = _skill(model)
-            kinematics, operators = skill.kinematics, getattr(model, "operators_", ())
-            required = (*skill.frame_names, *frame_names(config.via_operators(), kinematics))
+        self.config, self._model = config, model
+        self._placeholder = nn.Parameter(torch.zeros(()))  # optimizers refuse to have none
+        self._handle_removed_options()
+        kinematics, operators, required = self._describe_skill(dataset_meta)
         config.validate_features()
-        cell = opened(config)
+        cell = open_cell(config)
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
-        self._make_mixture(operators, model)
-        names = self.kinematics.joint_names
-        state_names = config.state_names or names
-        if model is not None:  # the robot at hand may state more than the data set did
+        # where structure was found, the configuration says what was asked for, not what it is
+        if isinstance(model, TaskParameterizedGMM) and config.choices() == Choices():
+            self._model = self._apply_overrides(model)
+        self.joints = self._match_joints(cell, dataset_meta)
+        if dataset_meta is not None and isinstance(self.kinematics, Robot):
+            self.kinematics = self.kinematics.unlimited(self.joints.raw)
+        summary = None if model is None else _skill(model).summary
+        names = select_observed(config, required, summary)
+        self.frames = self._locate_frames(names, config.frames)
+        self.watch = make_watch(cell, self.kinematics, self.frames)
+        self._learner = None
+        if dataset_meta is not None:
+            self._learner = self._make_learner(operators, required, dataset_meta)
+        self.reset()
+
+    def _make_learner(
+        self, operators: Sequence[Operator], required: Sequence[str], dataset_meta: Any
+    ) -> Learner:
+        """Return a learner, which sees the frames that the data set has recorded."""
+        config, at_links = self.config, self.config.training.link_frames
+        recorded = [name for name in required if name not in at_links]
+        places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
+        frames = self._locate_frames(recorded, places)
+        signals = self.joints, frames, dataset_meta
+        return Learner(config, self.kinematics, operators, *signals, self._model)
+
+    def _handle_removed_options(self) -> None:
+        """Refuse to train with options of release 0.3; a policy saved with them runs."""
+        if names := ", ".join(self.config.training.clear_removed_options()):
+            said = f"{names}: lerobot-train fits by EM alone since 0.4, without gradient steps"
+            if self._model is None:
+                raise DataError(f"{said}. Leave the option out")
+            log.warning("%s; the policy is what it was saved as", said)
+
+    def _describe_skill(
+        self, dataset_meta: Any
+    ) -> tuple[Kinematics, Sequence[Operator], list[str]]:
+        """Return robot, operators and names of the frames, of a model or of what to learn."""
+        config, model = self.config, self._model
+        if model is None:
+            kinematics, operators = self._describe_training(dataset_meta)
+            names = frame_names([*operators, *config.via_operators()], kinematics)
+            return kinematics, operators, list(dict.fromkeys(names))
+        if dataset_meta is not None:
+            check_dataset(config, dataset_meta)
+        skill = _skill(model)
+        names = *skill.frame_names, *frame_names(config.via_operators(), skill.kinematics)
+        operators = getattr(model, "operators_", ())
+        return skill.kinematics, operators, list(dict.fromkeys(names))
+
+    def _match_joints(self, cell: Any, dataset_meta: Any) -> JointFeatures:
+        """Find the joints among the entries of states and actions."""
+        config, names = self.config, self.kinematics.joint_names
+        state_names, action_names = config.state_names or names, config.action_names or names
+        if self._model is not None:  # the robot at hand may state more than the data set did
             size = (len(state_names),)
             config.input_features[OBS_STATE] = PolicyFeature(FeatureType.STATE, size)
         self._check_size("state_names", state_names, config.robot_state_feature)
-        action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
         offsets = getattr(cell, "joint_offsets", {})
         if dataset_meta is not None:  # a converted set declares none
-            offsets = declared(config, dataset_meta.features, "offsets")
+            offsets = read_declared(config, dataset_meta.features, "offsets")
         every = state_names, action_names, config.units
-        self.joints = JointFeatures(names, *every, self.kinematics, offsets)
-        if dataset_meta is not None and isinstance(self.kinematics, Robot):
-            self.kinematics = self.kinematics.unlimited(self.joints.raw)
-        environment = config.env_state_feature
-        width = environment.shape[0] if environment else None
-        named = config.environment_names, state_names
-        summary = None if model is None else skill.summary
-        seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
-        default = config.default_environment_state
-        self.frames = FrameFeatures(seen, config.frames, *named, default, width)
-        self.watch = watching(cell, self.kinematics, self.frames)
-        self._learner: Learner | None = None
-        if dataset_meta is not None:
-            recorded = [name for name in required if name not in config.training.link_frames]
-            places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
-            shown = FrameFeatures(recorded, places, *named, default, width)
-            self._learner = Learner(
-                config, self.kinematics, operators, self.mixture, self.joints, shown,
-                dataset_meta, self._become, model,
-            )  # fmt: skip
-        self.reset()
+        return JointFeatures(names, *every, self.kinematics, offsets)
 
-    def _asked(self, dataset_meta: Any) -> tuple[Kinematics, Sequence[Operator]]:
-        """Robot and operators of a policy that is not fitted."""
+    def _locate_frames(
+        self, names: Sequence[str], places: Mapping[str, Sequence[int | str]] | None
+    ) -> FrameFeatures:
+        """Find the poses of frames among the entries of observations."""
+        config, environment = self.config, self.config.env_state_feature
+        return FrameFeatures(
+            names,
+            places,
+            config.environment_names,
+            self.joints.state_names,
+            config.default_environment_state,
+            environment.shape[0] if environment else None,
+        )
+
+    def _describe_training(self, dataset_meta: Any) -> tuple[Kinematics, Sequence[Operator]]:
+        """Return robot and operators of a policy that is not fitted."""
         config = self.config
         kinematics: Kinematics | None = config.kinematics()
         operators: Sequence[Operator] | None = config.decoded_operators()
@@ -217,8 +253,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         # an object that only stands where links do differs from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
-        known |= {*(config.frames or ()), *poses_named(config.environment_names)}
-        known |= {*poses_named(config.state_names)}
+        known |= list_placed(config)
         for operator in operators:
             operator.check(kinematics, known - set(kinematics.links))
         return kinematics, operators
@@ -232,38 +267,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"another robot? Else name the entries in order, --policy.{field}='[...]'"
             )
 
-    def _make_mixture(self, operators: Sequence[Operator], model: Any) -> None:
-        """Mixture of a model of given structure, to be learned by gradient.
-
-        Optimizers are made before a fit, so what it decides on has one stand-in parameter each.
-        """
-        config, dtype = self.config, getattr(torch, self.config.em.dtype)
-        self._model, self._stale = model, False
-        plain = model is None or isinstance(model, TaskParameterizedGMM)
-        self._plain = plain and config.choices() == Choices()
-        if not self._plain:
-            self.mixture = MixtureParameters(1, [1], dtype)
-        else:
-            dimensions = [one.dimension(self.kinematics) for one in operators]
-            count: Any = config.n_components if model is None else len(model.weights_)
-            self.mixture = MixtureParameters(count, dimensions, dtype)
-        if model is not None:
-            self._become(model)
-            self._stale = self._plain and self._overridden(model)
-
-    def _become(self, model: Any) -> None:
-        """Take over a fitted model or skill."""
-        self._model = model
-        if self._plain:
-            self.mixture.copy_from(model)
-        else:
-            self.mixture.time = _skill(model).time.to(self.mixture.time, copy=True)
-            self.mixture.fitted.fill_(True)
-        self.to(self.mixture.time.device)
-
-    def _overridden(self, model: TaskParameterizedGMM) -> bool:
-        """Whether the configuration has other settings than a model; what cannot is refused."""
-        config, asked = self.config, self.config.decoded_operators()
+    def _apply_overrides(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
+        """Return the model with the configuration's settings; what cannot change is refused."""
+        config = self.config
+        asked = config.decoded_operators()
         there = list(map(format_operator, model.operators_))  # which has no mean paths
         changed = {
             "n_components": config.n_components != len(model.weights_),
@@ -275,11 +282,27 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"which has {len(model.weights_)} components and the operators {there}: fit "
                 "again to change them"
             )
-        return (
-            config.given_holds() not in (None, tuple(model.holds_))
-            or FusionConfig.of(model.skill.fusion) != config.fusion
-            or config.em.covariance_shrinkage != model.covariance_shrinkage
-            or config.em.dtype != model.dtype
+        given = config.given_holds()
+        settings = {
+            "fusion": FusionConfig.from_fusion(model.skill.fusion) != config.fusion,
+            "holds": given not in (None, tuple(model.holds_)),
+            "em.covariance_shrinkage": (
+                config.em.covariance_shrinkage != model.covariance_shrinkage
+            ),
+            "em.dtype": config.em.dtype != model.dtype,
+        }
+        if not any(settings.values()):
+            return model
+        return TaskParameterizedGMM.from_parameters(
+            model.weights_,
+            model.means_,
+            model.covariances_,
+            model.time_,
+            holds=model.holds_ if given is None else given,
+            n_demonstrations=model.n_demonstrations_,
+            peaks=model.skill.peaks,
+            summary=model.summary_,
+            **config.estimator(self.kinematics, model.operators_).get_params(deep=False),
         )
 
     @classmethod
@@ -294,7 +317,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         frames: Mapping[str, Sequence[int | str]] | None = None,
         **options: Any,
     ) -> Self:
-        """A policy that does what a fitted model does.
+        """Make a policy that does what a fitted model does.
 
         Parameters
         ----------
@@ -320,73 +343,43 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             If names or frames do not fit the model, or it holds an operator or a robot of
             your own, which a file cannot describe.
         """
-        skill = _skill(model)
-        try:
-            time = skill.time
-        except AttributeError:
-            raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
-        if fps is None and len(time) > 1:
-            fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        settings: dict[str, Any] = {"device": "cpu", "push_to_hub": False, "fps": fps}
-        if isinstance(model, TaskParameterizedGMM):
-            settings |= {"em": _settings(model), "fusion": FusionConfig.of(skill.fusion)}
-            settings["n_components"] = len(model.weights_)
+        settings = {"device": "cpu", "push_to_hub": False, **_settings(model)}
+        if fps is not None:
+            settings["fps"] = fps
         config = TPGMMConfig(**(settings | options))
+        skill = _skill(model)
         tensors: dict[str, Tensor] = {}
         model = decode(encode(model, tensors), (), tensors)  # what no file can hold is refused
-        kinematics = skill.kinematics
-        config.state_names = list(state_names or kinematics.joint_names)
-        config.action_names = list(action_names or kinematics.joint_names)
-        config.environment_names = list(environment_names) if environment_names else None
-        config.frames = {k: list(v) for k, v in frames.items()} if frames else None
-        seen = observed_frames(config, skill.frame_names, skill.summary)
+        config.state_names = list(state_names or skill.kinematics.joint_names)
+        config.action_names = list(action_names or skill.kinematics.joint_names)
+        config.environment_names = list(environment_names or ()) or None
+        config.frames = {k: list(v) for k, v in (frames or {}).items()} or None
+        seen = select_observed(config, skill.frame_names, skill.summary)
         poses = FrameFeatures(seen, config.frames, environment_names, config.state_names, None)
-        given = frames or {}
-        order = [name for name in poses.in_environment if name not in given]
-        if len(order) > 1 and not environment_names:
-            warnings.warn(
-                f"nothing says which entries of {OBS_ENV_STATE} belong to which object: they "
-                f"are read as the poses of {order}, in the order in which the operators name "
-                "them. Say it by environment_names, the names of the entries in the data set "
-                "('bottle.x', ..., 'bottle.qz'), or by frames",
-                PlausibilityWarning,
-                stacklevel=2,
-            )
+        _warn_of_order(config, list_missing(poses.in_environment, config.frames or ()))
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
         return cls(config, model=model).eval().to(config.device)
 
     def to_estimator(self) -> Any:
-        """The fitted model or skill that the policy is.
+        """Return the fitted model or skill that the policy is.
 
         Raises
         ------
         NotFittedError
             If the policy is not fitted.
         """
-        device = self.mixture.time.device
         if self._model is None:
             raise NotFittedError("the policy is not fitted: train it, or use from_estimator")
-        if self._stale or _skill(self._model).kinematics.lower.device != device:
-            self._model = self._renewed(device)
-            self._stale = self.training
+        device = self._placeholder.device
+        if _skill(self._model).kinematics.lower.device != device:
+            tensors: dict[str, Tensor] = {}
+            described = encode(self._model, tensors)
+            model = decode(described, (), {k: v.to(device) for k, v in tensors.items()})
+            if isinstance(model, TaskParameterizedGMM):
+                model.set_params(device=str(device))
+            self._model = model
         return self._model
-
-    def _renewed(self, device: torch.device) -> Any:
-        """The model with the numbers of the mixture, on its device."""
-        model, tensors = self._model, dict[str, Tensor]()
-        if not self._plain:
-            described = encode(model, tensors)
-            return decode(described, (), {k: v.to(device) for k, v in tensors.items()})
-        new = self.config.estimator(self.kinematics.to(device=device), model.operators_)
-        given, peaks = self.config.given_holds(), model.skill.peaks
-        return self.mixture.to_estimator(
-            new.set_params(device=str(device)),
-            holds=model.holds_ if given is None else given,
-            n_demonstrations=model.n_demonstrations_,
-            peaks=None if peaks is None else tuple(each.to(device) for each in peaks),
-            summary=model.summary_,
-        )
 
     @property
     def skill(self) -> Skill:
@@ -406,7 +399,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next joint references.
+        """Return the next joint references.
 
         Parameters
         ----------
@@ -428,7 +421,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError, ShapeError
             If the observation is not what the policy was made for.
         """
-        batch = self._seen(batch, 1 / self.config.rate)
+        batch = self._look(batch, 1 / self.config.rate)
         if self._controller is None:
             self._controller = self._begin(batch)
         if self._controller is None:
@@ -443,7 +436,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         prev_chunk_left_over: Tensor | None = None,
         **_unused: Any,
     ) -> Tensor:
-        """The next ``chunk_size`` references, of robots that follow.
+        """Return the next ``chunk_size`` references, of robots that follow.
 
         Called again in an episode, it goes on from the step of the last chunk at which the
         robot is: before the first action that is left over, where LeRobot's ``rtc`` says
@@ -462,13 +455,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         now = batch.get(TIMESTAMP)
         timestamp, last = None if now is None else float(now.flatten()[0]), self._chunk
-        batch, ahead = self._seen(batch, None if self._controller is None else 0.0), None
+        batch, ahead = self._look(batch, None if self._controller is None else 0.0), None
         if self._controller is not None:  # select_action says how far the episode is
             ahead = self._controller.copy()
         elif last is None:
             ahead = self._begin(batch)
         else:
-            passed = last.passed(self._observed(batch), timestamp, prev_chunk_left_over)
+            joints = self._read_joints(batch)
+            passed = last.find_last_sent(joints, timestamp, prev_chunk_left_over)
             measured, poses = self._measurements(batch, last.first)
             ahead = last.first.resumed(
                 last.moments[passed], passed / self.config.rate, measured, poses
@@ -489,16 +483,16 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return actions
 
     def supports_rtc(self) -> bool:
-        """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
+        """Return True: ``lerobot-rollout --inference.type=rtc`` may be used."""
         return True
 
-    def _seen(self, batch: dict[str, Tensor], passed: float | None) -> dict[str, Tensor]:
-        """An observation with the poses that are seen in its pictures, if there is a cell."""
+    def _look(self, batch: dict[str, Tensor], passed: float | None) -> dict[str, Tensor]:
+        """Add the poses that are seen in the pictures of an observation, if there is a cell."""
         first = self._controller is None and self._chunk is None
         if self.watch is None or not (first or self.config.control.follow_frames):
             return batch
         images = {k: v.numpy(force=True) for k, v in batch.items() if k.startswith(OBS_IMAGES)}
-        now, joints = batch.get(TIMESTAMP), self._observed(batch).numpy(force=True)
+        now, joints = batch.get(TIMESTAMP), self._read_joints(batch).numpy(force=True)
         times = None if now is None else now.flatten().numpy(force=True)
         self.watch.look(images, joints, passed, times)
         self._ages = self.watch.ages()
@@ -507,9 +501,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         )
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller | None:
-        """A running skill; None while robots stand because not all objects were seen."""
+        """Start the skill; None while robots stand because not all objects were seen."""
         check_rate(batch, self.config.rate)
-        joints = self._observed(batch)
+        joints = self._read_joints(batch)
         if self.watch is not None:
             if self._stand is None:
                 self._stand = self.kinematics.joint_tensor(joints)
@@ -537,8 +531,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _measurements(
         self, batch: Mapping[str, Tensor], controller: Controller
     ) -> tuple[Tensor | None, dict[str, Any] | None]:
-        """Joints and poses for a controller, as they were measured."""
-        shape, config, measured = controller.reference.shape, self.config, self._observed(batch)
+        """Return joints and poses for a controller, as they were measured."""
+        shape, config, measured = (
+            controller.reference.shape,
+            self.config,
+            self._read_joints(batch),
+        )
         begun = shape[0] if len(shape) == 2 else 1
         if len(measured) != begun:
             raise ShapeError(
@@ -555,7 +553,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _wrenches(
         self, batch: Mapping[str, Tensor], controller: Controller
     ) -> dict[str, Tensor]:
-        """Wrenches of links, ``observation.wrench.LINK``, as they were measured."""
+        """Return wrenches of links, ``observation.wrench.LINK``, as they were measured."""
         links = {WRENCH + link: link for link in self.kinematics.links}
         shape = *controller.reference.shape[:-1], 6
         return {links[key]: batch[key].reshape(shape) for key in links.keys() & batch.keys()}
@@ -563,10 +561,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _step(
         self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
     ) -> Tensor:
-        """The references (B, n_joints) of the next action."""
+        """Compute the references (B, n_joints) of the next action."""
         start, first = controller.reference, controller.command is None
         measured = self._measurements(batch, controller)
-        passed = self._passed(batch) if passed is None else passed
+        passed = self._measure_tick(batch) if passed is None else passed
         passed = float(passed) if start.ndim == 1 else passed
         wrenches = self._wrenches(batch, controller)
         command = controller.step(passed, *measured, ages=self._ages, wrenches=wrenches)
@@ -576,7 +574,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return controller.reference.reshape(-1, start.shape[-1])
 
     def _log(self, command: Command) -> None:
-        """A line for each robot whose status is another one than at the last action."""
+        """Log a line for each robot whose status is another one than at the last action."""
         several = command.codes.ndim > 0
         times = command.time.expand(command.codes.shape).flatten().tolist()
         for robot, status in enumerate(command.status if several else [command.status]):
@@ -587,8 +585,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
             self._statuses[robot] = told
 
-    def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
-        """Seconds for which the next reference is."""
+    def _measure_tick(self, batch: Mapping[str, Tensor]) -> float | Tensor:
+        """Return the seconds for which the next reference is."""
         period, now = 1 / self.config.rate, batch.get(TIMESTAMP)
         return period if now is None else self._ticks.next(now, period)
 
@@ -610,13 +608,13 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             "(--policy.control.largest_start_gap, null for any)"
         )
 
-    def _observed(self, batch: Mapping[str, Tensor]) -> Tensor:
+    def _read_joints(self, batch: Mapping[str, Tensor]) -> Tensor:
         if OBS_STATE not in batch:
             raise DataError(f"the policy needs {OBS_STATE}; the batch has {sorted(batch)}")
         return self.joints.joints(batch[OBS_STATE])
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
-        """The loss of a batch of a data set; see :mod:`lerobot_policy_tpgmm.training.learner`.
+        """Learn a batch of a data set; see :mod:`lerobot_policy_tpgmm.training.learner`.
 
         Parameters
         ----------
@@ -626,6 +624,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Returns
         -------
         loss : Tensor of shape ()
+            0: nothing is minimised. Without gradient for any parameter.
         None
             Where other policies have more figures for the log.
 
@@ -639,24 +638,26 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "training needs the data set's meta data: make_policy(config, ds_meta=...) "
                 "passes them, or TPGMMPolicy(config, dataset_meta=dataset.meta)"
             )
-        return self._learner.loss(batch, self.training), None
+        self._model = self._learner.learn(batch, self.training)
+        # no gradient, not a zero one: an optimizer's momentum must not move anything
+        return torch.zeros((), requires_grad=True), None
 
     def train(self, mode: bool = True) -> Self:
         """Switch between training and use; what was collected in training is fitted by then."""
         if not mode and self._learner is not None:
-            self._learner.end_epoch()
-        self._stale |= mode and self._plain and self._model is not None
+            self._model = self._learner.end_epoch()
         return super().train(mode)
 
     def get_optim_params(self) -> Any:
-        """Parameters that gradient training changes: the mixture."""
-        return self.mixture.parameters()
+        """Return a parameter that nothing changes, as an optimizer needs one."""
+        return self.parameters()
 
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
     ) -> None:
         if self._learner is not None:
             self._learner.check_saveable()
+            self._model = self._learner.model
         write_files(self.config, self.to_estimator(), Path(save_directory))
 
     def push_to_hub(self, repo_id: str, **options: Any) -> str:
@@ -686,7 +687,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return upload(repo_id, self.save_pretrained, card, **options)
 
     def generate_model_card(self, *given: Any, **options: Any) -> Any:
-        """LeRobot's card, which ``lerobot-train`` uploads, and what the mixture says."""
+        """Return LeRobot's card, which ``lerobot-train`` uploads, and what the mixture says."""
         card = super().generate_model_card(*given, **options)
         card.content = f"{card.content.rstrip()}\n\n{describe(self.to_estimator())}\n"
         return card
@@ -751,13 +752,36 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
 
 def _skill(model: Any) -> Any:
-    """Skill of a model, or a skill itself."""
+    """Return the skill of a model, or a skill itself."""
     return model.skill if isinstance(model, TaskParameterizedGMM) else model
 
 
-def _settings(model: TaskParameterizedGMM) -> EMConfig:
-    """Settings with which a model was learned; a policy has no generator of its own."""
-    settings = {each.name: getattr(model, each.name) for each in fields(EMConfig)}
-    if not isinstance(settings["random_state"], int):
-        settings["random_state"] = None
-    return EMConfig(**settings)
+def _settings(model: Any) -> dict[str, Any]:
+    """Return the settings of a model or skill for a configuration."""
+    skill = _skill(model)
+    try:
+        time = skill.time
+    except AttributeError:
+        raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
+    rate = round(float((len(time) - 1) / (time[-1] - time[0])), 6) if len(time) > 1 else None
+    settings: dict[str, Any] = {"fps": rate}
+    if isinstance(model, TaskParameterizedGMM):
+        em = {field.name: getattr(model, field.name) for field in fields(EMConfig)}
+        if not isinstance(em["random_state"], int):  # a configuration has no generator
+            em["random_state"] = None
+        settings |= {"em": EMConfig(**em), "n_components": len(model.weights_)}
+        settings["fusion"] = FusionConfig.from_fusion(model.skill.fusion)
+    return settings
+
+
+def _warn_of_order(config: TPGMMConfig, frames: Sequence[str]) -> None:
+    """Warn if only the order of the operators says which pose is which object's."""
+    if len(frames) > 1 and not config.environment_names:
+        warnings.warn(
+            f"nothing says which entries of {OBS_ENV_STATE} belong to which object: they "
+            f"are read as the poses of {list(frames)}, in the order in which the operators "
+            "name them. Say it by environment_names, the names of the entries in the data set "
+            "('bottle.x', ..., 'bottle.qz'), or by frames",
+            PlausibilityWarning,
+            stacklevel=3,
+        )

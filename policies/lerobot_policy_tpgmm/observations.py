@@ -7,7 +7,8 @@ found by name, and values converted both ways; the model works in radians and me
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -16,6 +17,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.names import match_names, pose_groups
 from tpgmm_datasets.units import Scale, Units, as_scale, units_of
 from tpgmm_torch import Frame
@@ -24,8 +26,8 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import Kinematics
 
 __all__ = [
-    "CONTROL_RATE", "FrameFeatures", "JointFeatures", "check_rate", "observed_frames",
-    "poses_named",
+    "CONTROL_RATE", "FrameFeatures", "JointFeatures", "check_rate", "find_poses",
+    "is_at_start", "list_placed", "select_observed",
 ]  # fmt: skip
 
 REMEDY = (
@@ -87,8 +89,7 @@ class JointFeatures(nn.Module):
         self.state_names, self.action_names = tuple(state_names), tuple(action_names)
         in_state = match_names(joint_names, state_names, OBS_STATE, REMEDY)
         in_action = match_names(joint_names, action_names, ACTION, REMEDY)
-        extra = [name for name in action_names if name not in in_action]
-        if extra:
+        if extra := list_missing(action_names, in_action):
             raise DataError(
                 f"the action has the entries {extra}, which are no joints of the model; it has "
                 f"{list(joint_names)}. Learn them too (--policy.joints; what moves no link of "
@@ -96,28 +97,27 @@ class JointFeatures(nn.Module):
                 "them: tpgmm dataset convert SET NEW --robot ROBOT --robot-joint PATTERN"
             )
         entry = {joint: name for name, joint in in_state.items()}
-        called = [in_state.get(name, name) for name in state_names]
-        called += [in_action[name] for name in action_names]
+        called = [*(in_state.get(name, name) for name in state_names)]
+        called += map(in_action.__getitem__, action_names)
         every = *state_names, *action_names
-        chosen = units_of(_scales(units), every, called, robot, OBS_STATE)
-        self.raw = {name for name, unit in zip(called, chosen, strict=True) if unit == "raw"}
-        scales = [as_scale(unit, name) for name, unit in zip(every, chosen, strict=True)]
-        added = [offsets.get(n, offsets.get(m, 0)) for n, m in zip(called, every, strict=True)]
-        scales = [Scale(s.factor, s.offset + x) for s, x in zip(scales, added, strict=True)]
-        state = [scales[every.index(entry[joint])] for joint in joint_names]
-        action = scales[len(state_names) :]
-        buffers = {
-            "columns": torch.tensor([self.state_names.index(entry[j]) for j in joint_names]),
-            "order": torch.tensor([self.joint_names.index(in_action[n]) for n in action_names]),
-            "scale": torch.tensor([(s.factor, s.offset) for s in state], dtype=torch.float64),
-            "back": torch.tensor([(s.factor, s.offset) for s in action], dtype=torch.float64),
-        }
-        for name, buffer in buffers.items():
-            # they follow from the configuration: not in the file
-            self.register_buffer(name, buffer, persistent=False)
+        chosen = units_of(_parse_units(units), every, called, robot, OBS_STATE)
+        units_by_name = list(zip(every, called, chosen, strict=True))
+        self.raw = {joint for _, joint, unit in units_by_name if unit == "raw"}
+        rows = [
+            _add_offset(as_scale(unit, name), offsets.get(joint, offsets.get(name, 0)))
+            for name, joint, unit in units_by_name
+        ]
+        scales = torch.tensor(rows, dtype=torch.float64)
+        columns = torch.tensor([every.index(entry[joint]) for joint in joint_names])
+        order = torch.tensor([self.joint_names.index(in_action[n]) for n in action_names])
+        # they follow from the configuration: not in the file
+        self.register_buffer("columns", columns, persistent=False)
+        self.register_buffer("order", order, persistent=False)
+        self.register_buffer("scale", scales[columns], persistent=False)
+        self.register_buffer("back", scales[len(state_names) :], persistent=False)
 
     def joints(self, state: Tensor) -> Tensor:
-        """Joint vectors (B, n_joints) in the model's order and units.
+        """Return joint vectors (B, n_joints) in the model's order and units.
 
         Parameters
         ----------
@@ -131,17 +131,13 @@ class JointFeatures(nn.Module):
         return state[:, self.columns] * self.scale[:, 0] + self.scale[:, 1]
 
     def action(self, joints: Tensor) -> Tensor:
-        """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
+        """Return actions (..., n_action), float32, from joint vectors (..., n_joints)."""
         ordered = joints[..., self.order]
         return ((ordered - self.back[:, 1]) / self.back[:, 0]).to(torch.float32)
 
-    def commanded(self, action: Tensor) -> Tensor:
-        """Joint vectors (..., n_joints) in the model's order and units, from actions."""
-        return self.targets(action)[..., self.order.argsort()]
-
-    def targets(self, action: Tensor) -> Tensor:
-        """Targets of the joints ``order`` of actions (..., n_action), in the model's units."""
-        return action * self.back[:, 0] + self.back[:, 1]
+    def decode_action(self, action: Tensor) -> Tensor:
+        """Return joint vectors (..., n_joints) in the model's order and units, from actions."""
+        return (action * self.back[:, 0] + self.back[:, 1])[..., self.order.argsort()]
 
 
 class FrameFeatures:
@@ -171,44 +167,48 @@ class FrameFeatures:
         default: Sequence[float] | None,
         n_environment: int | None = None,
     ) -> None:
-        for name in places or {}:
-            if name not in frame_names:
-                raise UnknownNameError("frame", name, "the model", frame_names)
-        named, stated = poses_named(environment_names), poses_named(state_names)
-        self.in_environment: dict[str, list[int]] = {}
-        self.in_state: dict[str, list[int]] = {}
-        for index, name in enumerate(frame_names):
-            environment, state = named.get(name), stated.get(name)
-            if places and name in places:
-                environment, placed = _placed(
-                    name, places[name], environment_names, state_names
-                )
-                state = placed or state
-            elif environment is None and not environment_names:
-                environment = [*range(POSE * index, POSE * (index + 1))]
-            if environment is not None:
-                self.in_environment[name] = environment
-            if state is not None:
-                self.in_state[name] = state
+        places, environment_names = places or {}, environment_names or ()
+        if unknown := list_missing(places, frame_names):
+            raise UnknownNameError("frame", unknown[0], "the model", frame_names)
+        named, stated = find_poses(environment_names), find_poses(state_names)
+        if not environment_names:  # then they follow one another
+            starts = range(0, POSE * len(frame_names), POSE)
+            named = {n: [*range(i, i + POSE)] for n, i in zip(frame_names, starts, strict=True)}
+        for name, place in places.items():
+            named.pop(name, None)
+            columns, in_state = _find_columns(name, place, environment_names, state_names)
+            (stated if in_state else named)[name] = columns
         self.frame_names = tuple(frame_names)
-        least = 1 + max((max(p) for p in self.in_environment.values()), default=-1)
-        self.n_environment = len(environment_names or ()) or n_environment or least
-        if self.n_environment < least:
+        self.in_environment = self._keep(named)
+        self.in_state = self._keep(stated)
+        self.n_environment = self._count_entries(len(environment_names) or n_environment)
+        self.default = None if default is None else self._make_default(default)
+
+    def _keep(self, found: Mapping[str, list[int]]) -> dict[str, list[int]]:
+        """Keep the columns of the frames that the model needs."""
+        return {name: found[name] for name in self.frame_names if name in found}
+
+    def _count_entries(self, given: int | None) -> int:
+        """Return the size of the environment's state, if not given that of its frames."""
+        least = 1 + max(chain(*self.in_environment.values()), default=-1)
+        if given and given < least:
             raise ShapeError(
-                f"{OBS_ENV_STATE} has {self.n_environment} entries, the frames "
-                f"{list(frame_names)} are at {self.in_environment}"
+                f"{OBS_ENV_STATE} has {given} entries, the frames {list(self.frame_names)} are "
+                f"at {self.in_environment}"
             )
-        self.default = None
-        if default is not None:
-            self.default = torch.tensor(list(default), dtype=torch.float64)
-            if len(self.default) != self.n_environment:
-                raise ShapeError(
-                    f"default_environment_state has {len(self.default)} values, "
-                    f"{OBS_ENV_STATE} has {self.n_environment}"
-                )
+        return given or least
+
+    def _make_default(self, default: Sequence[float]) -> Tensor:
+        """Return a whole state of the environment, of the right size."""
+        if len(default) != self.n_environment:
+            raise ShapeError(
+                f"default_environment_state has {len(default)} values, "
+                f"{OBS_ENV_STATE} has {self.n_environment}"
+            )
+        return torch.tensor(default, dtype=torch.float64)
 
     def frames(self, batch: Mapping[str, Any]) -> dict[str, Frame]:
-        """Poses (B,) of all frames.
+        """Return the poses (B,) of all frames.
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class FrameFeatures:
         return frames
 
     def with_poses(self, batch: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
-        """An observation in which frames are at poses (B, 7) that were ``found``."""
+        """Return an observation in which frames are at poses (B, 7) that were ``found``."""
         nothing = torch.full((self.n_environment,), math.nan, dtype=torch.float64)
         known = nothing if self.default is None else self.default
         environment = known.repeat(len(batch[OBS_STATE]), 1)
@@ -246,7 +246,7 @@ class FrameFeatures:
         return {**batch, OBS_ENV_STATE: environment.to(batch[OBS_STATE].device)}
 
     def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
-        """The same in the middle of an episode: (B, 7), of any values; None for a lost one."""
+        """Return poses (B, 7) of any values, within an episode; None for a lost one."""
         state, environment = batch[OBS_STATE], batch.get(OBS_ENV_STATE)
         poses: dict[str, Tensor | None] = {}
         for name in self.frame_names:
@@ -273,25 +273,44 @@ class FrameFeatures:
         return values.to(torch.float64)
 
 
-def observed_frames(
+def is_at_start(pose: LinkPose) -> bool:
+    """Return True for where a link is when the skill begins: it follows from the joints."""
+    return pose.event == "start" and pose.offset is None
+
+
+def list_placed(config: TPGMMConfig) -> set[str]:
+    """Return the frames of which the configuration says where they are observed."""
+    named = find_poses(config.environment_names), find_poses(config.state_names)
+    return {*(config.frames or ())}.union(*named)
+
+
+def select_observed(
     config: TPGMMConfig, required: Sequence[str], summary: TrainingSummary | None = None
 ) -> list[str]:
-    """Those of the ``required`` frames that a running policy observes.
+    """Select those of the ``required`` frames that a running policy observes.
 
     Where a link is at the start follows from the joints, unless the names of the entries of
     ``config`` tell of the frame. The ``summary`` is that of the demonstrations.
     """
-    poses = config.link_poses().items()
-    start = {name for name, pose in poses if pose.event == "start" and pose.offset is None}
+    start = {name for name, pose in config.link_poses().items() if is_at_start(pose)}
     if summary is not None:
         start |= {name for name, shown in summary.frames.items() if shown.link is not None}
-    placed = {*(config.frames or ()), *poses_named(config.environment_names)}
-    placed |= {*poses_named(config.state_names)}
+    placed = list_placed(config)
     return [name for name in required if name not in start or name in placed]
 
 
-def _scales(units: Any) -> Units:
-    """Units as they are in a configuration, ``[factor, offset]`` among them."""
+def list_missing(names: Iterable[str], known: Container[str]) -> list[str]:
+    """Return the names that are not known."""
+    return [name for name in names if name not in known]
+
+
+def _add_offset(scale: Scale, offset: float) -> tuple[float, float]:
+    """Return factor and offset of a unit, shifted."""
+    return scale.factor, scale.offset + offset
+
+
+def _parse_units(units: Any) -> Units:
+    """Parse units as they are in a configuration, ``[factor, offset]`` among them."""
     if not isinstance(units, Mapping):
         return units or "auto"
     for name, unit in units.items():
@@ -303,35 +322,34 @@ def _scales(units: Any) -> Units:
     return {n: unit if isinstance(unit, str) else Scale(*unit) for n, unit in units.items()}
 
 
-def poses_named(names: Sequence[str] | None) -> dict[str, list[int]]:
-    """Where poses are that names tell of; LeRobot puts ``.pos`` behind the names of robots."""
+def find_poses(names: Sequence[str] | None) -> dict[str, list[int]]:
+    """Return the positions of poses that names tell of; LeRobot puts ``.pos`` behind."""
     plain = [name.removesuffix(".pos") for name in names or ()]
     return {name: list(group) for name, group in pose_groups(plain).items()}
 
 
-def _placed(
+def _find_columns(
     name: str,
     place: Sequence[int | str],
-    environment_names: Sequence[str] | None,
+    environment_names: Sequence[str],
     state_names: Sequence[str],
-) -> tuple[list[int] | None, list[int] | None]:
-    """Columns of the environment's or of the robot's state."""
+) -> tuple[list[int], bool]:
+    """Return the columns of a pose, and whether they are of the robot's state."""
     if len(place) != POSE:
         raise DataError(f"frame {name!r} is at seven entries, x y z qw qx qy qz; got {place}")
     if all(isinstance(entry, int) and entry >= 0 for entry in place):
-        return [int(entry) for entry in place], None
-    for where, names in enumerate((environment_names or (), state_names)):
-        if all(entry in names for entry in place):
-            columns = [list(names).index(str(entry)) for entry in place]
-            return (None, columns) if where else (columns, None)
+        return [int(entry) for entry in place], False
+    for in_state, names in ((False, environment_names), (True, state_names)):
+        if set(place) <= set(names):
+            return [list(names).index(str(entry)) for entry in place], in_state
     raise DataError(
         f"frame {name!r} is at {list(place)}, which are not all entries of {OBS_ENV_STATE}, "
-        f"{list(environment_names or ())}, nor of {OBS_STATE}, {list(state_names)}"
+        f"{list(environment_names)}, nor of {OBS_STATE}, {list(state_names)}"
     )
 
 
 def check_rate(batch: Mapping[str, Any], rate: float) -> None:
-    """Whether observations come at the rate of the policy, if they say.
+    """Refuse observations that say that they come at another rate than the policy's.
 
     LeRobot itself does not compare: a policy made for 100 Hz would run at half its speed in an
     environment of 50 Hz. Those of ``lerobot_env_bimanual`` add their rate to each observation.

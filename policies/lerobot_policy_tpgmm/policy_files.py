@@ -55,7 +55,7 @@ def write_files(config: TPGMMConfig, model: Any, directory: Path) -> None:
 
 
 def _digest(file: Path) -> str:
-    """Of a whole file; of a processor's, of what could change numbers."""
+    """Return the digest of a file; of a processor's, of what could change numbers."""
     try:
         content = read_whole(file)
         if file.name in PROCESSORS:
@@ -86,7 +86,7 @@ def _check_digests(directory: Path) -> None:
 
 
 def read_model(directory: Path) -> Any:
-    """The model or skill of a policy.
+    """Read the model or skill of a policy.
 
     Raises
     ------

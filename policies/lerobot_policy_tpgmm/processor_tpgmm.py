@@ -14,7 +14,7 @@ __all__ = ["make_tpgmm_pre_post_processors"]
 def make_tpgmm_pre_post_processors(
     config: TPGMMConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[PolicyProcessorPipeline[Any, Any], PolicyProcessorPipeline[Any, Any]]:
-    """Renaming, batch dimension, device, and a normalisation that changes nothing.
+    """Make the pipelines: names, batch dimension, device, a normalisation that does nothing.
 
     The policy itself brings names, order and units together. LeRobot's commands override
     steps of all these names, so all are there.

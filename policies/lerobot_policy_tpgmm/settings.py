@@ -74,8 +74,8 @@ class FusionConfig:
     activation: str = "time"
 
     @classmethod
-    def of(cls, fusion: Fusion) -> FusionConfig:
-        """The settings of a form of fusion."""
+    def from_fusion(cls, fusion: Fusion) -> FusionConfig:
+        """Return the settings of a form of fusion."""
         if isinstance(fusion, CovarianceFusion):
             return cls("covariance", epsilon=fusion.epsilon, activation=fusion.activation)
         priorities = None if fusion.priorities is None else list(fusion.priorities)
@@ -87,7 +87,7 @@ class FusionConfig:
         return cls("information", prior_std, priorities, fusion.negligible)
 
     def value(self) -> Fusion:
-        """The form of fusion.
+        """Return the form of fusion.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class ControlConfig:
     closed_loop: bool = True
 
     def options(self) -> dict[str, Any]:
-        """Options of :class:`tpgmm_control.Controller`.
+        """Return the options of :class:`tpgmm_control.Controller`.
 
         Raises
         ------
@@ -185,10 +185,6 @@ class TrainingConfig:
     learn_from : {"measured", "commanded"}, default="measured"
         Whether the joints of a demonstration are its states or its actions. Measured joints
         lag behind commanded ones, by which a skill learned from them misses.
-    loss : {"likelihood", "imitation"}, default="likelihood"
-        Minimised by gradient once the mixture is fitted.
-    optimizer_lr : float, default=1e-4
-        Step size of that training.
     robust : bool, default=True
         Whether episodes that are unlike the others are left out.
     plausibility : {"warn", "error", "ignore"}, default="warn"
@@ -202,17 +198,25 @@ class TrainingConfig:
         :func:`tpgmm_datasets.events.parse_event` takes it. Others are those of the columns
         ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
         frame is are found by themselves, where there is no such column.
+    loss, optimizer_lr : optional
+        Of policies saved by release 0.3, for steps by gradient that are no more.
     """
 
     alignment: str = "dtw"
     alignment_features: list[str] | None = None
     learn_from: str = "measured"
-    loss: str = "likelihood"
-    optimizer_lr: float = 1e-4
     robust: bool = True
     plausibility: str = "warn"
     link_frames: dict[str, str] = field(default_factory=dict)
     events: dict[str, str] = field(default_factory=dict)
+    loss: str | None = None
+    optimizer_lr: float | None = None
+
+    def clear_removed_options(self) -> list[str]:
+        """Forget options of release 0.3 that have no effect; return those that were given."""
+        names = [name for name in ("loss", "optimizer_lr") if getattr(self, name) is not None]
+        self.loss = self.optimizer_lr = None
+        return [f"--policy.training.{name}" for name in names]
 
     def check(self) -> None:
         """Refuse settings that do not exist or do not go together.
@@ -223,11 +227,4 @@ class TrainingConfig:
         """
         check_choice("training.alignment", self.alignment, (*METHODS, "parts"))
         check_choice("training.learn_from", self.learn_from, ("measured", "commanded"))
-        check_choice("training.loss", self.loss, ("likelihood", "imitation"))
         check_choice("training.plausibility", self.plausibility, ("warn", "error", "ignore"))
-        if (self.learn_from, self.loss) == ("commanded", "imitation"):
-            raise DataError(
-                "the imitation error is that of actions that follow measured joints: "
-                "--policy.training.learn_from=commanded goes with "
-                "--policy.training.loss=likelihood"
-            )

@@ -33,7 +33,7 @@ class TickDurations:
         self._known: deque[Tensor] = deque(maxlen=TICKS)
 
     def next(self, timestamps: Tensor, usual: float) -> float | Tensor:
-        """Seconds for which the next reference is.
+        """Return the seconds for which the next reference is.
 
         Parameters
         ----------

@@ -47,7 +47,7 @@ def address(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def served(tmp_path, monkeypatch):
+def server(tmp_path, monkeypatch):
     """``main`` of the server, and the addresses at which it would have listened."""
     monkeypatch.chdir(tmp_path)
     from lerobot_policy_tpgmm import async_server
@@ -58,8 +58,8 @@ def served(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]"])
-def test_it_serves_this_machine(served, host):
-    main, found = served
+def test_it_serves_this_machine(server, host):
+    main, found = server
     main([f"--host={json.dumps(host)}", "--port=8090"])  # YAML
     assert found == [host]
 
@@ -67,8 +67,8 @@ def test_it_serves_this_machine(served, host):
 @pytest.mark.parametrize(
     "host", ["0.0.0.0", "192.168.0.7", "[::]", "", "robot.local", "localhost.evil.org"]
 )
-def test_other_machines_are_refused_unless_allowed(served, host, tmp_path):
-    main, found = served
+def test_other_machines_are_refused_unless_allowed(server, host, tmp_path):
+    main, found = server
     with pytest.raises(SystemExit, match=rf"^--host={re.escape(host)}: .*--allow-remote"):
         main([f"--host={json.dumps(host)}"])
     file = tmp_path / "server.yaml"
@@ -80,7 +80,7 @@ def test_other_machines_are_refused_unless_allowed(served, host, tmp_path):
     assert found == [host]
 
 
-def observed(state):
+def name_values(state):
     """Of joints and of the bottle, by name."""
     bottle = pose(bottle_demonstrations()[5].frames["bottle"])
     return dict(zip(NAMES + POSE, [*state.tolist(), *bottle.tolist()], strict=True))
@@ -103,7 +103,7 @@ def test_chunks_come_over_the_wire_and_go_on(address, tmp_path):
         stub.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(specs)))
         state, sent = batch()[STATE][0], []
         for turn in range(4):
-            seen = observed(state) | {"task": "shake"}
+            seen = name_values(state) | {"task": "shake"}
             observation = TimedObservation(time.time(), 8 * turn, seen, must_go=True)
             stub.SendObservations(
                 send_bytes_in_chunks(
@@ -128,7 +128,7 @@ def test_the_client_drives_a_robot(address, tmp_path, monkeypatch):
     from lerobot_robot_bimanual import BimanualConfig
 
     start, log = tmp_path / "start.json", tmp_path / "log.json"
-    start.write_text(json.dumps(observed(batch()[STATE][0])))
+    start.write_text(json.dumps(name_values(batch()[STATE][0])))
     client = RobotClient(
         RobotClientConfig(
             policy_type="tpgmm",

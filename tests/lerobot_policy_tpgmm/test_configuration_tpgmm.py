@@ -34,7 +34,7 @@ def test_defaults_of_the_estimator_are_those_of_the_configuration():
     assert config.fusion.value() == InformationFusion()
     assert FusionConfig(form="covariance").value() == CovarianceFusion()
     for fusion in (CovarianceFusion(1e-3, "product"), InformationFusion(5.0, [1, 0])):
-        assert FusionConfig.of(fusion).value() == fusion
+        assert FusionConfig.from_fusion(fusion).value() == fusion
 
 
 def test_fields_can_be_overridden(saved):
@@ -87,7 +87,6 @@ def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):
         ("clock", "sundial"),
         ("joint_timeout", 0.0),
         ("feedback", "velocity"),
-        ("loss", "hinge"),
         ("alignment", "guess"),
         ("form", "sum"),
         ("n_components", 0),

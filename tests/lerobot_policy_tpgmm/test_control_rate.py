@@ -19,7 +19,7 @@ def test_the_same_rate_is_accepted(told):
     check_rate({}, 100.0)  # most environments do not tell
 
 
-@pytest.mark.parametrize("told", [50, 99, 99.8, 100.2, 101, 150, 199, 200])
+@pytest.mark.parametrize("told", [50, 99.8, 100.2, 200])
 def test_another_rate_is_refused(told):
     message = rf"takes {told:g} actions per second, the policy gives 100: --policy.control_fps="
     with pytest.raises(DataError, match=message):

@@ -30,7 +30,7 @@ RATE, LONG = 20, 13.6
 BEGIN, END = 2.0, 4.0
 
 
-def reproduced(model, shown):
+def reproduce(model, shown):
     time = torch.linspace(0, LONG, round(LONG * RATE) + 1, dtype=torch.float64)
     [trajectory] = model.predict([Situation(shown.joints[0], shown.frames, time)])
     return trajectory.joints
@@ -73,7 +73,7 @@ def test_a_person_corrects_and_the_policy_goes_on(tmp_path, monkeypatch):
     from lerobot_robot_bimanual import BimanualConfig
 
     shown = bottle_demonstrations()[5]
-    model, path = small_bottle(), reproduced(small_bottle(), shown)
+    model, path = small_bottle(), reproduce(small_bottle(), shown)
     start = dict(zip(JOINTS, shown.joints[0].tolist(), strict=True))
     start |= dict(zip(POSE_NAMES, pose(shown.frames["bottle"]).tolist(), strict=True))
     (tmp_path / "start.json").write_text(json.dumps(start))

@@ -147,7 +147,7 @@ def test_units_may_be_the_calibration_of_the_robot(tmp_path):
     assert made.units == {name: [scale.factor, scale.offset] for name in NAMES[:3]}
 
 
-def tracked(path, **cell):
+def make_tracked_set(path, **cell):
     """A data set in which tracking has left its cell, and offsets of joints."""
     cell = {"cameras": planted.cell_content()["cameras"], **cell}
     (path / "meta").mkdir()
@@ -161,7 +161,7 @@ def tracked(path, **cell):
 
 def test_the_cell_of_a_tracked_set_goes_along(tmp_path):
     bottle = {"bottle": {"target": {"tag": 3, "size": 0.06}}}
-    meta, cell = tracked(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
+    meta, cell = make_tracked_set(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
     made = config(**UPPER_BODY)
     policy = TPGMMPolicy(made, dataset_meta=meta)
     assert made.cell == cell and policy.watch is not None
@@ -177,7 +177,7 @@ def test_the_cell_of_a_tracked_set_goes_along(tmp_path):
 
 def test_a_set_is_learned_with_its_own_offsets_and_run_with_those_of_its_cell(tmp_path, caplog):
     bottle = {"bottle": {"target": {"tag": 3, "size": 0.06}}}
-    meta, cell = tracked(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
+    meta, cell = make_tracked_set(tmp_path, objects=bottle, joint_offsets={NAMES[0]: 0.02})
     other = cell | {"joint_offsets": {NAMES[0]: 0.05}}
     policy = TPGMMPolicy(config(**UPPER_BODY, cell=other), dataset_meta=meta)
     assert float(policy.joints.joints(torch.zeros(1, 17))[0, 0]) == 0.02

@@ -28,7 +28,7 @@ LOST = np.full(7, np.nan)
 
 
 @pytest.fixture(autouse=True)
-def planted(monkeypatch):
+def install_source(monkeypatch):
     """The source of poses of these tests is installed."""
     monkeypatch.setattr(sources, "entry_points", lambda group: [ENTRY])
 
@@ -37,7 +37,7 @@ def seeing(**options: object) -> TPGMMPolicy:
     return policy(cell=cell_content(), control_fps=RATE, **options)
 
 
-def observed(lost=(), kind=torch.float32, rows=2):
+def observe_start(lost=(), kind=torch.float32, rows=2):
     """What is observed at the start, with pictures in place of poses."""
     poses = batch()[ENVIRONMENT].double().numpy()[:rows]
     shown = [LOST if row in lost else pose for row, pose in enumerate(poses)]
@@ -60,13 +60,13 @@ def test_it_does_what_it_does_with_the_poses_themselves(kind):
     acting, told = seeing(**OPEN), changed(fitted(), control_fps=RATE, **OPEN)
     start = batch()[STATE]
     for _ in range(2):  # three pictures are looked at before it begins
-        assert torch.equal(acting.select_action(observed(kind=kind)), start)
+        assert torch.equal(acting.select_action(observe_start(kind=kind)), start)
     for _ in range(20):
-        now = acting.select_action(observed(kind=kind))
+        now = acting.select_action(observe_start(kind=kind))
         torch.testing.assert_close(now, told.select_action(batch()), rtol=0, atol=1e-5)
     before = [source.resets for source in acting.watch.sources]
     acting.reset()
-    assert torch.equal(acting.select_action(observed()), start)
+    assert torch.equal(acting.select_action(observe_start()), start)
     assert [source.resets for source in acting.watch.sources] == [n + 1 for n in before]
 
 
@@ -74,7 +74,10 @@ def test_pictures_count_more_than_the_state_of_the_environment():
     acting, other = seeing(**OPEN), seeing(**OPEN)
     misled = {ENVIRONMENT: batch()[ENVIRONMENT] + 0.3}
     for _ in range(10):
-        one, two = acting.select_action(observed()), other.select_action(observed() | misled)
+        one, two = (
+            acting.select_action(observe_start()),
+            other.select_action(observe_start() | misled),
+        )
     assert torch.equal(one, two)
 
 
@@ -82,7 +85,7 @@ def test_a_source_is_given_joints_by_name_and_the_time():
     acting = seeing()
     for tick in range(3):
         stamp = {"observation.timestamp": torch.full((2, 1), 0.04 * tick)}
-        acting.select_action(observed() | (stamp if tick < 2 else {}))
+        acting.select_action(observe_start() | (stamp if tick < 2 else {}))
     joints, time = acting.watch.sources[1].calls[-1]
     assert time == pytest.approx(0.08)
     wanted = dict(zip(acting.kinematics.joint_names, batch()[STATE][1].tolist(), strict=True))
@@ -93,27 +96,27 @@ def test_robots_stand_until_all_objects_were_seen(caplog):
     acting, start = seeing(), batch()[STATE]
     with caplog.at_level("INFO"):
         for _ in range(40):
-            assert torch.equal(acting.select_action(observed(lost=[1])), start)
+            assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
     assert lines(caplog)[-1] == (
         "holding before the start: robot 1 does not see 'bottle' (a hand hides it)"
     )
     for _ in range(4):
-        action = acting.select_action(observed())
+        action = acting.select_action(observe_start())
     assert not torch.equal(action, start)
     acting.reset()
     message = r"robot 1 does not see 'bottle' \(a hand hides it\), for 5 s .*\['front'\]"
     for _ in range(round(5 * RATE)):
-        assert torch.equal(acting.select_action(observed(lost=[1])), start)
+        assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
     with pytest.raises(DataError, match=message):
         for _ in range(3):
-            acting.select_action(observed(lost=[1]))
+            acting.select_action(observe_start(lost=[1]))
 
 
 def test_one_wrong_pose_of_the_first_ones_does_not_count():
     acting = seeing(**OPEN)
-    wrong = observed()
+    wrong = observe_start()
     wrong[KEY] = pictures(batch()[ENVIRONMENT].double().numpy() + np.eye(7)[0])
-    seen = [wrong, observed(), observed()]
+    seen = [wrong, observe_start(), observe_start()]
     for one in seen:
         acting.select_action(one)
     frame = acting._controller._first_frames["bottle"].position
@@ -124,7 +127,7 @@ def run(acting, ticks, lost, held=()):
     """The actions of a robot that follows, which is alone, and does not see at some ticks."""
     state, actions = batch()[STATE][:1], []
     for tick in range(ticks):
-        now = observed(lost=[0] if tick in lost else [], rows=1) | {STATE: state}
+        now = observe_start(lost=[0] if tick in lost else [], rows=1) | {STATE: state}
         if acting._controller is not None:
             acting.watch.sources[0].problem = "camera 'front' was moved" if tick in held else ""
         state = acting.select_action(now)
@@ -170,19 +173,19 @@ def test_chunks_stand_while_nothing_can_be_trusted():
     start = batch()[STATE][:1]
     for _ in range(2):
         assert torch.equal(
-            acting.predict_action_chunk(observed(rows=1)), start[None].expand(1, 20, -1)
+            acting.predict_action_chunk(observe_start(rows=1)), start[None].expand(1, 20, -1)
         )
-    one = acting.predict_action_chunk(observed(rows=1))
+    one = acting.predict_action_chunk(observe_start(rows=1))
     assert float((one[:, -1] - start).abs().max()) > 1e-3
     acting.watch.sources[0].problem = "camera 'front' was moved"
-    two = acting.predict_action_chunk(observed(rows=1) | {STATE: one[:, 5]})
+    two = acting.predict_action_chunk(observe_start(rows=1) | {STATE: one[:, 5]})
     assert float(two.diff(dim=1).abs()[:, 10:].max()) < 1e-4
 
 
 def test_objects_may_be_read_at_the_start_alone():
     acting = seeing(**OPEN)
     for _ in range(3):
-        acting.select_action(observed())
+        acting.select_action(observe_start())
     acting.select_action({STATE: batch()[STATE]})
     assert len(acting.watch.sources[0].calls) == 3
 
@@ -199,18 +202,18 @@ def test_objects_may_be_read_at_the_start_alone():
 )  # fmt: skip
 def test_pictures_that_are_not_those_of_the_camera_are_refused(spoiled, message):
     with pytest.raises(DataError, match=message):
-        seeing().select_action(spoiled(observed()))
+        seeing().select_action(spoiled(observe_start()))
 
 
 def test_other_pictures_are_not_looked_at():
-    more = observed() | {"observation.images.wrist": torch.full((2, 3, 5, 5), torch.nan)}
+    more = observe_start() | {"observation.images.wrist": torch.full((2, 3, 5, 5), torch.nan)}
     assert torch.equal(seeing().select_action(more), batch()[STATE])
 
 
 # Cells
 
 
-def reloaded(folder, cell=None):
+def load_again(folder, cell=None):
     given = [] if cell is None else [f"--cell={cell}"]
     config = PreTrainedConfig.from_pretrained(folder, cli_overrides=given)
     return TPGMMPolicy.from_pretrained(folder, config=config)
@@ -218,14 +221,14 @@ def reloaded(folder, cell=None):
 
 def test_it_remembers_the_cell_and_takes_another(tmp_path, caplog):
     seeing().save_pretrained(tmp_path / "policy")
-    same = reloaded(tmp_path / "policy")
+    same = load_again(tmp_path / "policy")
     assert same.config.cell == cell_content() and KEY in same.config.input_features
     assert not any("another cell" in line for line in lines(caplog))
     other = cell_content(joint_offsets={"l_elbow": 0.02, "r_hip": 0.1})
     other["cameras"]["front"]["pose"] = [1.0, 0.02, 1.0, 1.0, 0.0, 0.0, 0.0]
     other["objects"]["bottle"]["target"] = {"tag": 4, "size": 0.06}
     (tmp_path / "cell.json").write_text(json.dumps(other))
-    again = reloaded(tmp_path / "policy", tmp_path / "cell.json")
+    again = load_again(tmp_path / "policy", tmp_path / "cell.json")
     [told] = [line for line in lines(caplog) if "another cell" in line]
     for part in (
         "'front' of the cameras was moved by 20.0 mm and 0.00 deg",
@@ -239,14 +242,14 @@ def test_it_remembers_the_cell_and_takes_another(tmp_path, caplog):
     assert torch.allclose((joints - batch()[STATE])[:, elbow], torch.tensor(0.02).double())
     torch.testing.assert_close(again.joints.action(joints), batch()[STATE])
     again.save_pretrained(tmp_path / "again")
-    assert reloaded(tmp_path / "again").config.cell == other
+    assert load_again(tmp_path / "again").config.cell == other
 
 
 @pytest.mark.parametrize("no", ["none", "null"])
 def test_without_its_cameras_it_reads_poses_and_keeps_the_offsets(tmp_path, no):
     kept = cell_content(joint_offsets={"l_elbow": 0.02})
     changed(fitted(), cell=kept, control_fps=RATE).save_pretrained(tmp_path / "policy")
-    blind = reloaded(tmp_path / "policy", no)
+    blind = load_again(tmp_path / "policy", no)
     assert blind.watch is None and KEY not in blind.config.input_features
     assert blind.config.cell["joint_offsets"] == {"l_elbow": 0.02}
     assert blind.joints.scale[:, 1].max() == 0.02
@@ -273,7 +276,7 @@ def test_cells_that_do_not_fit_are_refused(tmp_path):
 # Commands
 
 
-def tagged(folder, pose, **changed_):
+def draw_tags(folder, pose, **changed_):
     """A cell with a camera above a tag, which is at a pose (7,), and the picture of that."""
     place = rigid(np.zeros(3), pose[:3])
     cell = recorded_tags.cell_content(
@@ -304,7 +307,7 @@ def rollout(home, *more):
 
 def test_lerobot_rollout_finds_the_frames_by_itself(tmp_path):
     pose = batch()[ENVIRONMENT][0].double().numpy()
-    cell, picture = tagged(tmp_path, pose)
+    cell, picture = draw_tags(tmp_path, pose)
     changed(fitted(), control_fps=20.0).save_pretrained(tmp_path / "policy")
     done, log = rollout(tmp_path, f"--policy.cell={cell}", f"--robot.picture={picture}")
     assert done.returncode == 0, done.stderr
@@ -318,14 +321,14 @@ def test_lerobot_rollout_finds_the_frames_by_itself(tmp_path):
 
 
 def test_lerobot_rollout_without_that_camera_says_what_to_do(tmp_path):
-    cell, _ = tagged(tmp_path, batch()[ENVIRONMENT][0].double().numpy())
+    cell, _ = draw_tags(tmp_path, batch()[ENVIRONMENT][0].double().numpy())
     changed(fitted(), control_fps=20.0).save_pretrained(tmp_path / "policy")
     done, _ = rollout(tmp_path, f"--policy.cell={cell}")
     assert done.returncode != 0
     assert "takes the pictures 'observation.images.front', there are []" in done.stderr
 
 
-def rendered():
+def rendered_picture():
     """An environment whose camera sees the bottle, and its cell."""
     env = BottleShakingEnv(fps=20, cameras="front")
     env.reset(seed=3)
@@ -334,7 +337,7 @@ def rendered():
 
 @needs_pictures
 def test_poses_of_a_rendered_environment_are_true():
-    env, cell = rendered()
+    env, cell = rendered_picture()
     acting = changed(fitted(), control_fps=20.0, cell=cell)
     now, _ = env.reset(seed=3)
     for _ in range(5):
@@ -351,7 +354,7 @@ def test_poses_of_a_rendered_environment_are_true():
 
 @needs_pictures
 def test_lerobot_eval_looks_through_the_cameras_of_an_environment(tmp_path):
-    env, cell = rendered()
+    env, cell = rendered_picture()
     env.close()
     changed(fitted(), control_fps=20.0, cell=cell).save_pretrained(tmp_path / "policy")
     command = (

@@ -38,7 +38,7 @@ RATE = 20.0
 STEPS = len(small_bottle().time_)
 
 
-def predicted(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
+def predict(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
     found = rollout(model.skill, given, bounds="robot", blend=1.0)
     return torch.stack([trajectory.joints for trajectory in found])
 
@@ -50,7 +50,7 @@ def assert_close(actions: torch.Tensor, joints: torch.Tensor, tolerance: float =
 def test_open_loop_it_is_what_the_model_predicts():
     actions = act(played(), batch(), STEPS)
     assert actions.dtype == torch.float32 and actions.shape == (2, STEPS, 17)
-    assert_close(actions, predicted(small_bottle(), situations(batch())))
+    assert_close(actions, predict(small_bottle(), situations(batch())))
     assert float((actions[0] - actions[1]).abs().max()) > 0.1
 
 
@@ -60,7 +60,7 @@ def test_a_start_off_the_skill_is_blended_in_as_predict_does():
     observed[STATE][0, 4] += 0.5
     actions = act(played(), observed, STEPS)
     assert_close(actions[:, 0], observed[STATE].double())
-    assert_close(actions, predicted(small_bottle(), situations(observed)))
+    assert_close(actions, predict(small_bottle(), situations(observed)))
 
 
 def test_after_the_end_it_holds():
@@ -75,7 +75,7 @@ def test_time_advances_by_the_control_rate(rate):
     time = torch.arange(0, duration, 1 / rate, dtype=torch.float64)
     actions = act(changed(played(), control_fps=rate), batch(), len(time))
     # where a bound is just reached, rounding decides between two ways to keep it
-    assert_close(actions, predicted(model, situations(batch(), time)), 1e-5)
+    assert_close(actions, predict(model, situations(batch(), time)), 1e-5)
     assert fitted().config.fps == pytest.approx((STEPS - 1) / duration, abs=1e-6)
 
 
@@ -150,9 +150,9 @@ def test_objects_are_read_at_the_start_or_followed(follow):
     frame = Frame(seen[..., :3], seen[..., 3:])
     moved = Situation(situation.joints, {"bottle": frame}, small_bottle().time_)
     # the place of an object that creeps follows it within a second
-    assert_close(actions, predicted(small_bottle(), [moved])[0], 0.03 if follow else 1e-6)
+    assert_close(actions, predict(small_bottle(), [moved])[0], 0.03 if follow else 1e-6)
     if follow:
-        stood = predicted(small_bottle(), situations(batch()))[0]
+        stood = predict(small_bottle(), situations(batch()))[0]
         assert float((actions - stood).abs().max()) > 0.06
 
 
@@ -176,7 +176,7 @@ def test_joints_alone_need_no_robot_and_no_frames():
     start = waves()[1].joints[0]
     actions = act(acting, {STATE: start[None].float()}, len(model.time_))
     # from rest, accelerated as was demonstrated at most three times over
-    expected = predicted(model, [Situation(start.float().double())])[0]
+    expected = predict(model, [Situation(start.float().double())])[0]
     assert (actions[0, 1] - start).abs().max() < 0.1 < (expected[1] - start).abs().max()
     assert_close(actions[0, 10:], expected[10:])
 
@@ -192,7 +192,7 @@ def test_tracked_bodies_are_moved_on_their_manifold():
     actions = act(acting, observed, len(hands().time_))[0]
     at = observed[ENVIRONMENT][0].double()
     given = Situation(observed[STATE][0].double(), {"cup": Frame(at[:3], at[3:])})
-    assert_close(actions, predicted(hands(), [given])[0])
+    assert_close(actions, predict(hands(), [given])[0])
     for start in HANDS.quaternion_starts:
         norms = actions[:, start : start + 4].norm(dim=-1)
         torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
@@ -201,7 +201,7 @@ def test_tracked_bodies_are_moved_on_their_manifold():
 # Closed loop
 
 
-def closed(**fields: object) -> TPGMMPolicy:
+def close_loop(**fields: object) -> TPGMMPolicy:
     return changed(fitted(), control_fps=RATE, **fields)
 
 
@@ -226,16 +226,16 @@ def as_it_is(step, now):
 def test_a_robot_that_follows_is_moved_as_in_open_loop():
     steps = round(float(small_bottle().time_[-1]) * RATE)
     # followed frames differ in the last bit, which this coarse model makes much of
-    actions = run(closed(follow_frames=False), steps, as_it_is)
+    actions = run(close_loop(follow_frames=False), steps, as_it_is)
     assert_close(actions, act(changed(played(), control_fps=RATE), batch(), steps).double())
-    wanted = predicted(small_bottle(), situations(batch()))
+    wanted = predict(small_bottle(), situations(batch()))
     assert_close(run(changed(fitted(), joint_timeout=1.0), STEPS, as_it_is), wanted)
 
 
 def test_each_robot_of_a_batch_does_what_it_does_alone():
-    together = run(closed(), 60, as_it_is)
+    together = run(close_loop(), 60, as_it_is)
     for row in range(2):
-        alone = run(closed(), 60, as_it_is, slice(row, row + 1))
+        alone = run(close_loop(), 60, as_it_is, slice(row, row + 1))
         assert_close(together[row : row + 1], alone.double())
 
 
@@ -247,9 +247,9 @@ def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what, caplog):
             now[what][1] = float("nan")
         return now
 
-    undisturbed = run(closed(), 120, as_it_is)
+    undisturbed = run(close_loop(), 120, as_it_is)
     with caplog.at_level("INFO"):
-        actions = run(closed(), 120, observe)
+        actions = run(close_loop(), 120, observe)
     log = [line.removeprefix("robot 1 at ") for line in caplog.messages]
     assert [line.split()[5] for line in log] == ["holding:", "running"]
     assert "is missing or not finite" in log[0]
@@ -270,8 +270,8 @@ def test_timestamps_tell_how_much_time_has_passed():
         }
 
     for period in (2 / RATE, 1 / (2 * RATE)):
-        wanted = run(changed(closed(), control_fps=1 / period), 12, as_it_is)
-        assert_close(run(closed(), 12, told(period)), wanted.double())
+        wanted = run(changed(close_loop(), control_fps=1 / period), 12, as_it_is)
+        assert_close(run(close_loop(), 12, told(period)), wanted.double())
 
 
 # Chunks
@@ -282,8 +282,8 @@ def alone() -> dict[str, torch.Tensor]:
 
 
 def test_chunks_go_on_from_where_the_robot_is():
-    acting = closed(chunk_size=20)
-    whole = closed(chunk_size=100).predict_action_chunk(alone())
+    acting = close_loop(chunk_size=20)
+    whole = close_loop(chunk_size=100).predict_action_chunk(alone())
     speed = whole.diff(dim=1).abs().amax()
     assert float(speed) > 0.01  # it does not stop for want of observations
     acting.reset()
@@ -298,7 +298,7 @@ def test_chunks_go_on_from_where_the_robot_is():
 
 @pytest.mark.parametrize("told", ["timestamp", "left over"])
 def test_what_tells_the_step_counts_more_than_the_posture(told):
-    acting = closed(chunk_size=20)
+    acting = close_loop(chunk_size=20)
     chunk = acting.predict_action_chunk({**alone(), "observation.timestamp": torch.zeros(1, 1)})
     now = {**alone(), STATE: chunk[0, 3:4]}  # the robot lags behind the seventh action
     more = {}

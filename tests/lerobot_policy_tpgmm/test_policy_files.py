@@ -1,5 +1,6 @@
 """The pretrained directory: complete, read strictly, and refused where it does not belong."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -96,13 +97,22 @@ def test_the_pipelines_around_it_change_nothing(saved):
     assert torch.equal(before(observed)[STATE], batch()[STATE])
 
 
-def test_what_gradient_steps_changed_is_saved(directory):
-    policy = changed(fitted()).train()
-    with torch.no_grad():
-        policy.mixture.means[0][:, 1:] += 0.01
-    policy.eval().save_pretrained(directory)
-    wanted = small_bottle().means_[0][:, 1:] + 0.01
-    torch.testing.assert_close(load(directory / "model").means_[0][:, 1:], wanted)
+def test_a_policy_of_release_0_3_with_options_of_gradient_steps_runs(directory, caplog):
+    file, digests = directory / "config.json", directory / "digests.json"
+    config = json.loads(file.read_text())
+    config["training"] |= {"loss": "imitation", "optimizer_lr": 1e-4}
+    file.write_text(json.dumps(config))
+    told = json.loads(digests.read_text())
+    told["config.json"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    digests.write_text(json.dumps(told))
+    old = loaded(directory, env_cfg=make_env_config("bottle_shaking"))
+    assert caplog.text.count("--policy.training.loss, --policy.training.optimizer_lr: ") == 1
+    assert torch.equal(act(old, batch(), 5), act(fitted(), batch(), 5))
+    old.save_pretrained(directory)
+    caplog.clear()
+    again = TPGMMPolicy.from_pretrained(directory)
+    assert again.config.training == fitted().config.training
+    assert "optimizer_lr" not in caplog.text
 
 
 # What is refused at load

@@ -1,1 +1,1 @@
-"""Training by ``lerobot-train``: demonstrations gathered, losses reported, the model fitted."""
+"""Training by ``lerobot-train``: demonstrations gathered, and the model fitted."""

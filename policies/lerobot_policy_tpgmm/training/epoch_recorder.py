@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["COLUMNS", "EpochRecorder", "episode_ranges", "located"]
+__all__ = ["EpochRecorder", "episode_ranges"]
 
 #: What is kept of a frame.
 COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
@@ -22,7 +22,7 @@ OFF_GRID = 0.1
 
 
 def episode_ranges(dataset_meta: Any) -> dict[int, range]:
-    """The global indices of the frames of each episode of a LeRobot data set."""
+    """Return the global indices of the frames of each episode of a LeRobot data set."""
     names = ("episode_index", "dataset_from_index", "dataset_to_index")
     columns = [dataset_meta.episodes[name] for name in names]
     return {
@@ -31,8 +31,10 @@ def episode_ranges(dataset_meta: Any) -> dict[int, range]:
     }
 
 
-def located(batch: Mapping[str, Any], ranges: Mapping[int, range]) -> tuple[Tensor, Tensor]:
-    """Which frame of which episode the members of a batch are.
+def locate_frames(
+    batch: Mapping[str, Any], ranges: Mapping[int, range]
+) -> tuple[Tensor, Tensor]:
+    """Return the episode and the step of each frame of a batch.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ class EpochRecorder:
             If a value is not finite, a column is missing, or a frame is not in the data set,
             comes at another time, or has other values than before.
         """
-        numbers, steps = located(batch, self.ranges)
+        numbers, steps = locate_frames(batch, self.ranges)
         self._check(batch, numbers, steps)
         self._batch_size = max(self._batch_size, len(steps))
         indices = batch["index"].detach().cpu().flatten()
@@ -130,7 +132,7 @@ class EpochRecorder:
         return bool(repeated.any())
 
     def _check(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> None:
-        """Whether values are finite, and frames come at their time."""
+        """Refuse values that are not finite, and frames that come at another time."""
         for key in (*COLUMNS, ACTION):
             finite = batch.get(key, steps).detach().cpu().isfinite().reshape(len(steps), -1)
             bad = ~finite.all(1)
@@ -158,17 +160,20 @@ class EpochRecorder:
 
     @property
     def complete(self) -> bool:
-        """Whether there are episodes, all of them without gaps."""
-        return 0 < int(self._seen.sum()) == self._expected
+        """True if there are episodes, all of them without gaps."""
+        return 0 < int(self._seen.sum()) == self._count_frames()
 
-    @property
-    def _expected(self) -> int:
-        """Number of frames of these episodes."""
+    def _count_frames(self) -> int:
+        """Count the frames that the episodes have in the data set."""
         return sum(len(self.ranges[number]) for number in self.episodes)
 
+    def clear(self) -> None:
+        """Free the memory of what was recorded."""
+        self._columns.clear()
+
     def __str__(self) -> str:
-        """Frames that were gathered, and how many steps of training are needed."""
-        n_episodes, n_frames = len(self.episodes), self._expected
+        """Say how many frames have come, and how many steps of training are needed."""
+        n_episodes, n_frames = len(self.episodes), self._count_frames()
         if not n_episodes:
             return "no frame has come yet"
         needed = math.ceil(n_frames / self._batch_size)

@@ -39,7 +39,7 @@ def robot():
     return Robot.from_urdf(upper_body_urdf(), ["l_hand"], coordinates=["l_gripper"])
 
 
-def shown(seed, closing):
+def demonstrate(seed, closing):
     """All joints swing; the gripper closes, if it does."""
     rng, time = np.random.default_rng(seed), np.arange(LENGTH) / FPS
     swing = 0.2 * np.sin(time[:, None] + np.arange(17)) + 0.1 * rng.normal(size=17)
@@ -51,14 +51,14 @@ def shown(seed, closing):
     return Demonstration(time, joints, joint_names=robot().joint_names)
 
 
-def written(path, closings):
-    episodes = [shown(seed, closing) for seed, closing in enumerate(closings)]
+def write_set(path, closings):
+    episodes = [demonstrate(seed, closing) for seed, closing in enumerate(closings)]
     return save_lerobot(episodes, path, fps=FPS, task="grip", units={"l_gripper": "raw"})
 
 
 @pytest.fixture(scope="module")
 def grips(tmp_path_factory):
-    return dataset(written(tmp_path_factory.mktemp("grips") / "set", CLOSINGS))
+    return dataset(write_set(tmp_path_factory.mktemp("grips") / "set", CLOSINGS))
 
 
 @pytest.fixture(scope="module")
@@ -91,18 +91,8 @@ def test_operators_that_nobody_names_see_the_frames_too(grips):
     assert {"start", "bottle"} <= {*poses.references()}
 
 
-def test_more_steps_change_nothing_and_say_so(policy, grips, caplog):
-    learner = fresh(grips, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
-    for batch in epoch(grips, 32):
-        learner.forward(batch)
-    with caplog.at_level("WARNING"):
-        loss, _ = learner.forward(epoch(grips, 32)[0])
-    assert loss.item() == 0
-    assert "frames are at events, l_hand@close, l_hand@start" in caplog.text
-
-
 def test_episodes_without_the_event_are_named(tmp_path):
-    data = dataset(written(tmp_path / "set", (2.0, None, 1.8, None)))
+    data = dataset(write_set(tmp_path / "set", (2.0, None, 1.8, None)))
     learner = fresh(data, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
     with pytest.raises(DataError, match=r"'close', .* is not found in episodes \[1, 3\]"):
         for batch in [*epoch(data, 32), *epoch(data, 32)]:
@@ -113,7 +103,7 @@ def test_episodes_without_the_event_are_named(tmp_path):
 def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, told):
     flags = [one + 0.5 for one in CLOSINGS]
     episodes = [
-        replace(shown(seed, closing), events={"close": flag})
+        replace(demonstrate(seed, closing), events={"close": flag})
         for seed, (closing, flag) in enumerate(zip(CLOSINGS, flags, strict=True))
     ]
     save_lerobot(episodes, tmp_path / "set", fps=FPS, task="grip", units={"l_gripper": "raw"})

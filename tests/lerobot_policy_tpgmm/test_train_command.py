@@ -46,23 +46,23 @@ def train(folder, *arguments: str) -> str:
     return done.stderr
 
 
-def logged(log: str, name: str) -> list[float]:
+def read_figures(log: str, name: str) -> list[float]:
     return [float(value) for value in re.findall(rf"\b{name}[:=](-?[\d.]+|nan|inf)", log)]
 
 
-def saved(folder, step: int, output: str = "out") -> TPGMMPolicy:
+def load_checkpoint(folder, step: int, output: str = "out") -> TPGMMPolicy:
     checkpoint = folder / output / "checkpoints" / f"{step:06d}"
     return TPGMMPolicy.from_pretrained(checkpoint / "pretrained_model")
 
 
 @pytest.fixture(scope="module")
 def log(folder, n_steps):
-    """The first epoch, then as many steps by gradient; checkpoints and losses after both."""
+    """An epoch and a step more; checkpoints and losses of held-out frames after both."""
     return train(
         folder, "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
-        f"--policy.n_components={K}", "--policy.training.loss=imitation", "--num_workers=0",
+        f"--policy.n_components={K}", "--num_workers=0",
         "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
-        "--dataset.eval_split=0.2", f"--batch_size={BATCH}", f"--steps={2 * n_steps}",
+        "--dataset.eval_split=0.2", f"--batch_size={BATCH}", f"--steps={n_steps + 1}",
         f"--save_freq={n_steps}", f"--eval_steps={n_steps}", f"--output_dir={folder / 'out'}",
     )  # fmt: skip
 
@@ -71,7 +71,7 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     learned, held_out = demonstrations[:4], demonstrations[4:]
     aligned = DynamicTimeWarping(robot=upper_body()).fit_transform(learned)
     model = TaskParameterizedGMM(K, bottle_operators(), upper_body()).fit(aligned)
-    policy = saved(folder, n_steps)
+    policy = load_checkpoint(folder, n_steps)
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(held_out) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-5)
@@ -79,31 +79,31 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     frames = sum(map(len, learned))
     for said in (f"{frames} frames of 4 episodes collected", f"{K} components fitted by"):
         assert said in log
-    assert logged(log, "loss")[:n_steps] == [0.0] * n_steps
+    assert set(read_figures(log, "loss")) == set(read_figures(log, "eval_loss")) == {0.0}
 
 
-def test_then_the_loss_falls_by_gradient(folder, log, n_steps):
-    losses = logged(log, "loss")[n_steps:]
-    assert len(losses) == n_steps and min(losses) > 0
-    before, after = logged(log, "eval_loss")
-    assert after < before
-    fitted, trained = (saved(folder, step).to_estimator() for step in (n_steps, 2 * n_steps))
-    change = (trained.means_[0] - fitted.means_[0]).abs().max()
-    assert 1e-4 < change < 1e-4 * 1.01 * n_steps  # Adam's steps are of the size optimizer_lr
-
-
-def test_a_run_is_resumed(folder, log, n_steps):
-    end = 2 * n_steps + n_steps + 2
+def test_more_steps_and_a_resumed_run_change_nothing(folder, log, n_steps):
+    assert log.count("more steps change nothing") == 1
+    end = n_steps + 3
     checkpoint = folder / "out" / "checkpoints" / "last" / "pretrained_model"
     resumed = train(
         folder, f"--config_path={checkpoint / 'train_config.json'}", "--resume=true",
         f"--steps={end}", "--eval_steps=1",
     )  # fmt: skip
-    losses = logged(resumed, "loss")
-    # the frames are collected anew, which changes nothing, and then it goes on
-    assert losses[:n_steps] == [0.0] * n_steps and min(losses[n_steps:]) > 0
-    held_out = logged(resumed, "eval_loss")
-    assert set(held_out[:n_steps]) == {logged(log, "eval_loss")[-1]}
-    assert held_out[-1] < held_out[0]
-    assert "components fitted" not in resumed
-    saved(folder, end)
+    assert (
+        set(read_figures(resumed, "loss")) == set(read_figures(resumed, "eval_loss")) == {0.0}
+    )
+    assert "more steps change nothing" in resumed and "components fitted" not in resumed
+    fitted = load_checkpoint(folder, n_steps).to_estimator()
+    for step in (n_steps + 1, end):
+        same(load_checkpoint(folder, step).to_estimator(), fitted, 0)
+
+
+def test_options_that_went_are_refused_in_words(folder):
+    done = lerobot(
+        "train", "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
+        "--policy.training.loss=imitation", "--num_workers=0", "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
+        f"--output_dir={folder / 'refused'}", home=folder,
+    )  # fmt: skip
+    assert done.returncode and "--policy.training.loss: lerobot-train fits by EM" in done.stderr
