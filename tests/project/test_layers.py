@@ -86,7 +86,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "lerobot_policy_tpgmm": (
         ("settings", "tick_durations"),
         ("configuration_tpgmm",),
-        ("processor_tpgmm", "observations", "mixture_parameters"),
+        ("processor_tpgmm", "observations"),
         ("eyes",),
         ("dataset_contract", "policy_files", "training"),
         ("modeling_tpgmm",),
