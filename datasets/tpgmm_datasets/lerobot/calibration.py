@@ -97,9 +97,9 @@ def _scale(name: str, motor: Any, file: str | Path) -> Scale:
     if drive_mode:
         message = (
             f"motor {name!r} has the drive mode {drive_mode}. Whether LeRobot turned it round "
-            f"depends on its bus: say units={{{name!r}: Scale.calibrated({low}, {high}, "
+            f"depends on its bus: say units={{{name!r}: Scale.from_calibration({low}, {high}, "
             f"stored={stored})}} for Dynamixel, stored={stored[::-1]} for Feetech, and leave "
             "the motor out of the file"
         )
         raise DatasetError(message, file=file)
-    return Scale.calibrated(low, high, stored=stored)
+    return Scale.from_calibration(low, high, stored=stored)

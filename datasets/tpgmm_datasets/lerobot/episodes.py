@@ -217,7 +217,7 @@ def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array
     values: Array = flat.to_numpy(zero_copy_only=False).reshape(rows, feature.width)
     if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
         row, place = np.argwhere(~finite)[0].tolist()
-        first = f"row {row}, {feature.called[place]}"
+        first = f"row {row}, {feature.labels[place]}"
         message = f"{(~finite).sum()} values are NaN or infinite, the first: {first}"
         raise DatasetError(message, check="nan", **where)
     return values

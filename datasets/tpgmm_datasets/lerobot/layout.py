@@ -79,7 +79,7 @@ class Feature:
         return math.prod(self.shape)
 
     @property
-    def called(self) -> tuple[str, ...]:
+    def labels(self) -> tuple[str, ...]:
         """Name of its values in messages."""
         return self.names or tuple(f"value {i}" for i in range(self.width))
 

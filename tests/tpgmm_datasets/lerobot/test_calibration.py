@@ -83,8 +83,8 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         calibration={"left_": file, "right_": str(file)},
         units={"right_gripper.pos": "raw"},
     )
-    scales = [Scale.calibrated(*ends) for ends in RANGES.values()][:2]
-    scales.append(Scale.calibrated(*RANGES["gripper"], stored=(0, 100)))
+    scales = [Scale.from_calibration(*ends) for ends in RANGES.values()][:2]
+    scales.append(Scale.from_calibration(*RANGES["gripper"], stored=(0, 100)))
     scales = [*scales, *scales[:2], Scale(1.0)]
     expected = rows[:12] * [s.factor for s in scales] + [s.offset for s in scales]
     np.testing.assert_allclose(first.joints.numpy(), expected, rtol=0, atol=1e-12)
@@ -104,7 +104,7 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         ),
         (
             {"wrist_roll": motor(1, (0, 9), drive_mode=1)},
-            r"'wrist_roll' has the drive mode 1.*Scale\.calibrated\(0, 9",
+            r"'wrist_roll' has the drive mode 1.*Scale\.from_calibration\(0, 9",
         ),
     ],
 )
