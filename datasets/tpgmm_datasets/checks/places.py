@@ -15,7 +15,7 @@ def found_at(
     places: Sequence[tuple[str, int, str]],
     value: float = nan,
 ) -> Iterator[Finding]:
-    """The finding about some places, if there are any.
+    """Report some places as one finding, if there are any.
 
     Parameters
     ----------
