@@ -15,7 +15,7 @@ from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
-from tpgmm_datasets.units import Scale, add_offsets, as_scale
+from tpgmm_datasets.units import Scale, add_offsets
 
 __all__ = ["CELL", "Signals"]
 
@@ -82,15 +82,16 @@ class Signals:
         assembly = recording.assembly
         layout, columns = assembly.layout, assembly.joints
         features = {STATE: columns.feature, **layout.features}
-        keys = [key for key in (STATE, ACTION) if key in features]
-        names = {key: _name_values(features[key], columns, joint_names) for key in keys}
+        observed = {key: features[key] for key in (STATE, ACTION) if key in features}
+        names = {k: _name_values(f, columns, joint_names) for k, f in observed.items()}
         scales = _select_scales(columns, columns.scales, robot)
-        for key in keys:
-            if features[key].key != columns.feature.key:
-                _check_units(features[key], names[key], scales)
+        for key, feature in observed.items():
+            if feature.key != columns.feature.key:
+                _check_units(feature, names[key], scales)
         cell = layout.root / CELL
-        if cell.exists():  # which has the offsets, and a policy adds them
-            bare = [as_scale(unit, columns.feature.key) for unit in columns.units]
+        there = cell.exists()
+        if there:  # which has the offsets, and a policy adds them
+            bare = add_offsets(columns.units, None, columns.feature.key)
             scales = _select_scales(columns, bare, robot)
         environment = layout.features.get(ENVIRONMENT)
         return cls(
@@ -100,7 +101,7 @@ class Signals:
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
             _locate_frames(frame_sources(layout, frames, recording.episodes), environment),
-            cell if cell.exists() else None,
+            cell if there else None,
         )
 
 
@@ -108,8 +109,9 @@ def _select_scales(
     columns: JointColumns, scales: Sequence[Scale], robot: Any
 ) -> dict[str, Scale]:
     """Select the scales of the robot's joints, of all values without a robot."""
-    named = zip(columns.names or (), scales, strict=False)
-    return {n: scale for n, scale in named if robot is None or n in robot.joint_names}
+    names = columns.names or ()
+    joints = names if robot is None else robot.joint_names
+    return {n: scale for n, scale in zip(names, scales, strict=False) if n in joints}
 
 
 def _locate_frames(
@@ -130,16 +132,19 @@ def _name_values(
 ) -> tuple[str, ...] | None:
     """Name values as ``joint_names`` says; those without names are the joints in order."""
     called = joint_names if isinstance(joint_names, Mapping) else {}
+    source, names = columns.feature, feature.names
     given = None if called or joint_names is None else columns.names
-    source = columns.feature
     alike = feature.width == source.width
-    if feature.misnamed and not (alike and given):
-        message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
-        raise DatasetError(message, column=feature.key)
-    names = feature.names
+    _check_names(feature, alike and bool(given))
     if alike and (names is None or (given and names == source.names)):
         names = given or source.names
     return names and tuple(called.get(name, name) for name in names)
+
+
+def _check_names(feature: Feature, given: bool) -> None:
+    if feature.misnamed and not given:
+        message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
+        raise DatasetError(message, column=feature.key)
 
 
 def _check_units(

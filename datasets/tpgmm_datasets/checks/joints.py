@@ -53,12 +53,10 @@ def joint_findings(
     """
     low = np.min([episode.low for episode in episodes], axis=0)
     high = np.max([episode.high for episode in episodes], axis=0)
-    names = (robot.joint_names if robot is not None else episodes[0].joint_names) or tuple(
-        f"joint {i}" for i in range(len(low))
-    )
-    quaternion = {i for group in quaternion_columns(names, robot) for i in group}
-    others = {i for i, name in enumerate(names) if name in raw or is_gripper(name)}
-    angles = sorted({*range(len(names))} - quaternion - others)
+    named = episodes[0] if robot is None else robot
+    names = named.joint_names or tuple(f"joint {i}" for i in range(len(low)))
+    quaternion = set().union(*quaternion_columns(names, robot))
+    angles = _select_angles(names, raw, quaternion)
     yield from _check_limits(episodes, names, (low, high), angles, robot)
     small = np.maximum(-low, high) <= LARGEST_ANGLE
     yield from _check_steps(episodes, names, [i for i in angles if small[i]])
@@ -66,6 +64,14 @@ def joint_findings(
     yield from _check_stuck(episodes, names)
     if not isinstance(robot, Poses):  # hands may stay in a plane
         yield from _check_idle(episodes, names, quaternion)
+
+
+def _select_angles(
+    names: Sequence[str], raw: Collection[str], quaternion: Collection[int]
+) -> list[int]:
+    """Select the joints that are in radians or metres, and no part of a quaternion."""
+    others = {i for i, name in enumerate(names) if name in raw or is_gripper(name)}
+    return sorted({*range(len(names))} - others.union(quaternion))
 
 
 def _check_limits(

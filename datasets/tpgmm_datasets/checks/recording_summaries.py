@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -164,14 +164,16 @@ def _find_plateaus(joints: Array, steps: Array) -> tuple[JointEvent, ...]:
         least = 0.5 * np.quantile(size, 0.75)
         for end in (column.min(), column.max()):
             plateau = joint, float(end), float(np.ptp(column))
-            runs = _runs(column == end) if least else []
-            found += [plateau for run in runs if _is_cut_off(*run, size, least)]
+            runs = _runs(column == end).tolist()
+            found += [plateau for run in runs if _is_cut_off(run, size, least)]
     return tuple(found)
 
 
-def _is_cut_off(begin: int, stop: int, size: Array, least: float) -> bool:
-    """Check if steps before and after a run of one value are larger than ``least``."""
+def _is_cut_off(run: Sequence[int], size: Array, least: float) -> bool:
+    """Check if steps before and after a run of one value are larger than ``least`` > 0."""
+    begin, stop = run
     # the steps onto the plateau and from it are cut off too: look one further
     inside = begin > 1 and stop < len(size)
-    long = stop - begin >= SHORTEST_PLATEAU
-    return bool(inside and long and min(size[begin - 2], size[stop]) > least)
+    if not inside or stop - begin < SHORTEST_PLATEAU or not least:
+        return False
+    return bool(min(size[begin - 2], size[stop]) > least)

@@ -39,7 +39,7 @@ EventSource = str | Detector | Callable[[Demonstration], float]
 def frame_sources(
     layout: Layout, frames: Mapping[str, FrameSource] | None, chosen: Sequence[Episode]
 ) -> dict[str, Pose]:
-    """Where each frame is in the chosen episodes; None stands for those that the set names.
+    """Find where each frame is in the chosen episodes; None stands for those the set names.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def _frame_source(
             return MeasuredPoses.read(name, path, wanted, known)
         return LinkPose.parse(text) if "@" in text else FramePose(text)
     given = isinstance(source, Pose)
-    return source if given else MeasuredPoses.given(name, source, wanted, known)
+    return source if given else MeasuredPoses.take(name, source, wanted, known)
 
 
 def event_sources(
@@ -75,18 +75,18 @@ def event_sources(
     stored: Collection[str],
     names: Sequence[str] | None,
 ) -> dict[str, Detector | Callable[[Demonstration], float]]:
-    """How each event is found: as given, and where a frame is at one, by the event's name.
+    """Choose how each event is found: as given, and where a frame is at one, by its name.
 
     Parameters
     ----------
     events : mapping of str to str, Detector or callable, or None
-        Those that are given.
+        Events that are given.
     frames : mapping of str to FramePose, LinkPose, MeasuredPoses or Frame
-        Which may be at others.
+        Sources of the frames, some perhaps at other events.
     stored : collection of str
         Events that are there already.
     names : sequence of str or None
-        Of all signals.
+        Names of all signals, a gripper's among them.
 
     Raises
     ------
@@ -100,30 +100,34 @@ def event_sources(
         name: parse_event(source) if isinstance(source, str) else source
         for name, source in (events or {}).items()
     }
+    at_links = {n: (p.link, p.event) for n, p in frames.items() if isinstance(p, LinkPose)}
     usual: dict[str, Detector] = {}
-    for name, pose in frames.items():
-        if not isinstance(pose, LinkPose) or not isinstance(pose.event, str):
+    for name, (link, event) in at_links.items():
+        if not isinstance(event, str) or event in sources or event in stored:
             continue
-        where, event = f"frame {name!r}", pose.event
-        if event in sources or event in stored:
-            continue
-        try:
-            detector = usual_event(event, pose.link, names or ())
-        except DataError as error:
-            message = f"{where}: event {event!r} is not in the data set, and {error}"
-            raise DatasetError(message) from error
+        detector = _find_usual_event(name, event, link, names or ())
         if detector is not None and usual.setdefault(event, detector) != detector:
             raise DatasetError(
-                f"{where}: {event!r} of {pose.link!r} is another event than of the other "
-                f"links; call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
+                f"frame {name!r}: {event!r} of {link!r} is another event than of the other "
+                f"links; call it otherwise: events={{'{event}_{link}': 'closing:SIGNAL'}}"
             )
     return sources | usual
+
+
+def _find_usual_event(
+    frame: str, event: str, link: str, names: Sequence[str]
+) -> Detector | None:
+    try:
+        return usual_event(event, link, names)
+    except DataError as error:
+        message = f"frame {frame!r}: event {event!r} is not in the data set, and {error}"
+        raise DatasetError(message) from error
 
 
 def stored_frames(
     layout: Layout, sources: Mapping[str, Pose], rows: EpisodeRows
 ) -> dict[str, Frame]:
-    """The frames of an episode that are not at links."""
+    """Read the frames of an episode that are not at links."""
     frames, where = dict[str, Frame](), rows.episode.where
     for name, source in sources.items():
         if isinstance(source, FramePose):
@@ -187,24 +191,24 @@ class Assembly:
         """Features that have to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        joints = [one.feature for one in (self.joints, self.measured) if one]
+        joints = [one.feature for one in (self.joints, self.measured_joints) if one]
         return [*joints, *objects, *event_features(self.layout), *wrench_features(self.layout)]
 
     @property
-    def measured(self) -> JointColumns | None:
+    def measured_joints(self) -> JointColumns | None:
         """The measured joints, where ``joints`` are the same as they are commanded.
 
         In them it is found what the robot holds.
         """
-        stored, own = self.layout.features, self.joints.feature
-        state = next((stored[key] for key in MEASURED if key in stored), own)
-        alike = state != own and (state.names, state.width) == (own.names, own.width)
-        known = own.key in COMMANDED and isinstance(self.robot, Kinematics)
+        stored, read = self.layout.features, self.joints.feature
+        state = next((stored[key] for key in MEASURED if key in stored), read)
+        alike = state != read and (state.names, state.width) == (read.names, read.width)
+        known = read.key in COMMANDED and isinstance(self.robot, Kinematics)
         return replace(self.joints, feature=state) if alike and known else None
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
-        where, measured = rows.episode.where, self.measured
+        where, measured = rows.episode.where, self.measured_joints
         joints = self.joints.values(rows.values[self.joints.feature.key], **where)
         demonstration = Demonstration(
             torch.from_numpy(rows.time),

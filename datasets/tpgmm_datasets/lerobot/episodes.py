@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, summed_up
+from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, list_problems
 from tpgmm_datasets.lerobot.files import METADATA_KEY
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
 from tpgmm_datasets.lerobot.parquet import MOST_IN_EPISODE, episode_tables, open_parquet
@@ -77,7 +77,7 @@ class Relaxed:
 
     def warn(self) -> None:
         """Tell of the problems that were kept since, those that are alike as one."""
-        for text in summed_up(self.problems):
+        for text in list_problems(self.problems):
             # the caller is some levels up, how many depends on the way
             warnings.warn(f"left out or not checked: {text}", DatasetWarning, stacklevel=3)
         self.problems = []
@@ -110,17 +110,11 @@ def _read_file(
     path, needed = layout.root / file, ["episode_index", *keys]
     with open_parquet(path, layout.root, needed, BOOKKEEPING) as parquet:
         schema = parquet.schema_arrow
-        for problem in _declaration_problems(layout, file, schema.metadata or {}):
+        for problem in _compare_declarations(layout, file, schema.metadata or {}):
             policy(problem)
         counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
         values = len(counters) + sum(feature.width for feature in features)
-        rows, longest = parquet.metadata.num_rows, max(listed.values())
-        if (longest + max(rows - sum(listed.values()), 0)) * values > MOST_IN_EPISODE:
-            message = (
-                f"it has {rows} rows of {values} values, for episodes of at most {longest}"
-            )
-            message += f"; of one at most {MOST_IN_EPISODE} values are read"
-            raise DatasetError(message, check="metadata", file=file)
+        _check_size(file, parquet.metadata.num_rows, values, listed.values())
         columns = list(dict.fromkeys([*counters, *keys]))
         for index, table in episode_tables(parquet, file, columns):
             if index in seen:
@@ -137,10 +131,22 @@ def _read_file(
         policy(DatasetError(message, check="metadata", file=file, episode=index))
 
 
-def _declaration_problems(
+def _check_size(file: Path, rows: int, values: int, lengths: Collection[int]) -> None:
+    """Refuse rows of so many values that an episode would fill the memory."""
+    longest = max(lengths)
+    if (longest + max(rows - sum(lengths), 0)) * values > MOST_IN_EPISODE:
+        raise DatasetError(
+            f"it has {rows} rows of {values} values, for episodes of at most {longest}; of one "
+            f"at most {MOST_IN_EPISODE} values are read",
+            check="metadata",
+            file=file,
+        )
+
+
+def _compare_declarations(
     layout: Layout, file: Path, metadata: Mapping[bytes, bytes]
 ) -> Iterator[DatasetError]:
-    """Differences between ``info.json`` and what our writer left in the data file."""
+    """Yield differences between ``info.json`` and what our writer left in the data file."""
     if METADATA_KEY not in metadata:
         return
     try:
@@ -164,12 +170,12 @@ def _rows(
     features: Sequence[Feature],
     policy: Policy,
 ) -> Iterator[EpisodeRows]:
-    """The checked arrays of an episode; none if it has a problem that the policy lets pass."""
-    problems = list(_row_problems(layout, episode, table))
+    """Yield the checked arrays of an episode; none if a problem of it is let pass."""
+    problems = list(_check_rows(layout, episode, table))
     values = {}
     for feature in features:
         try:
-            values[feature.key] = _column_values(table, feature, episode)
+            values[feature.key] = _read_values(table, feature, episode)
         except DatasetError as error:
             problems.append(error)
     for problem in problems:
@@ -179,21 +185,15 @@ def _rows(
         yield EpisodeRows(episode, row_times(stamps, len(table), layout.fps), values)
 
 
-def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
-    """All contradictions between the rows of an episode and the metadata, and in time."""
+def _check_rows(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
+    """Yield contradictions between the rows of an episode and the metadata, and in time."""
     where, rows = episode.where, len(table)
     if rows != episode.length:
         message = f"the metadata give {episode.length} rows, the file has {rows}"
         yield DatasetError(message, check="metadata", **where)
     for name, start in {"frame_index": 0, "index": episode.start}.items():
-        if name not in table.column_names or start is None:
-            continue
-        column = table[name]
-        if not pa.types.is_integer(column.type) or column.null_count:
-            yield DatasetError("not all are whole numbers", column=name, **where)
-        elif (column.to_numpy() != np.arange(start, start + rows)).any():
-            message = f"it does not count from {start} in steps of one"
-            yield DatasetError(message, check="metadata", column=name, **where)
+        if name in table.column_names and start is not None:
+            yield from _check_counter(table[name], start, where | {"column": name})
     if "timestamp" in table.column_names:
         column = table["timestamp"]
         if not pa.types.is_floating(column.type) or column.null_count:
@@ -202,10 +202,19 @@ def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator
             yield from time_problems(column.to_numpy(), layout.fps, **where)
 
 
-def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
-    """The values of a feature, shape (T, width), without a copy where arrow allows."""
+def _check_counter(column: Any, start: int, where: Mapping[str, Any]) -> Iterator[DatasetError]:
+    """Check that a column counts from ``start`` in steps of one."""
+    if not pa.types.is_integer(column.type) or column.null_count:
+        yield DatasetError("not all are whole numbers", **where)
+    elif (column.to_numpy() != np.arange(start, start + len(column))).any():
+        message = f"it does not count from {start} in steps of one"
+        yield DatasetError(message, check="metadata", **where)
+
+
+def _read_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
+    """Read the values of a feature, shape (T, width), without a copy where arrow allows."""
     where, rows = episode.where | {"column": feature.key}, len(table)
-    flat = _flat(table[feature.key].combine_chunks(), where)
+    flat = _flatten(table[feature.key].combine_chunks(), where)
     declared, stored = feature.dtype, str(flat.type)
     if stored != ARROW_NAMES.get(declared, declared) and (declared, stored) not in WIDER:
         message = f"it holds {stored}, info.json declares {declared}"
@@ -223,8 +232,8 @@ def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array
     return values
 
 
-def _flat(column: Any, where: Mapping[str, Any]) -> Any:
-    """All values of an arrow column of numbers, or of equally long lists of them."""
+def _flatten(column: Any, where: Mapping[str, Any]) -> Any:
+    """Flatten an arrow column of numbers, or of equally long lists of them."""
     if isinstance(column.type, pa.ExtensionType):
         column = column.storage
     nulls = column.null_count

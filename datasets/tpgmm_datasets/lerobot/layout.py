@@ -31,10 +31,10 @@ MOST_VALUES = 100_000
 #: Indices beyond this are mistakes: floats could not count them.
 LARGEST_INDEX = 2**53
 HIGHEST_FPS = 1e6
-EPISODE_COLUMNS = (
+#: Of a listed episode: the first two in both layouts, all in v3.0.
+ROW_NUMBERS = (
     "episode_index",
     "length",
-    "tasks",
     "dataset_from_index",
     "dataset_to_index",
     "data/chunk_index",
@@ -85,7 +85,7 @@ class Feature:
 
     @property
     def is_camera(self) -> bool:
-        """Whether it is a video or image, which this project does not read."""
+        """True of a video or image, which this project does not read."""
         return self.dtype in CAMERAS
 
 
@@ -156,7 +156,7 @@ class Layout:
     problems: tuple[DatasetError, ...] = ()
 
     def feature(self, key: str) -> Feature:
-        """The declared feature of that name.
+        """Return the declared feature of that name.
 
         Raises
         ------
@@ -192,7 +192,7 @@ def open_layout(root: Path) -> Layout:
         raise DatasetError(message, file=INFO)
     features = _features(info)
     modern = version == "v3.0"
-    rows = _listed_episodes(root) if modern else _json_lines(root, "meta/episodes.jsonl")
+    rows = _list_episodes(root) if modern else _json_lines(root, "meta/episodes.jsonl")
     episodes = sorted((_episode(info, *row, modern) for row in rows), key=lambda e: e.index)
     tasks = _tasks(root, modern)
     return Layout(
@@ -252,31 +252,32 @@ def _feature(key: str, entry: Any) -> Feature:
         raise DatasetError(message, file=INFO, column=key)
     extra = about if isinstance(about := entry.get("info"), dict) else {}
     names, misnamed = value_names(entry.get("names"), width, key)
-    listed, wrong = value_names(extra.get("units"), width, distinct=False)
+    units, wrong = value_names(extra.get("units"), width, distinct=False)
     if wrong:
         message = f"its units cannot be used, {wrong}: mend them, or leave them out"
         raise DatasetError(message, file=INFO, column=key)
-    offsets = extra.get("offsets")
-    if offsets is not None and not _numbers(offsets, width):
+    offsets = _parse_offsets(extra.get("offsets"), width, key)
+    return Feature(key, dtype, tuple(sizes), names, units, misnamed, offsets)
+
+
+def _parse_offsets(offsets: Any, width: int, key: str) -> tuple[float, ...] | None:
+    """Check that offsets, where there are any, are finite numbers, one for each value."""
+    if offsets is None:
+        return None
+    whole = isinstance(offsets, list) and len(offsets) == width
+    if not whole or not all(type(x) in (int, float) and math.isfinite(x) for x in offsets):
         message = f"its joint offsets are {width} numbers in radians, got {str(offsets)[:80]}"
         raise DatasetError(message, file=INFO, column=key)
-    shifts = None if offsets is None else tuple(map(float, offsets))
-    return Feature(key, dtype, tuple(sizes), names, listed, misnamed, shifts)
+    return tuple(map(float, offsets))
 
 
-def _numbers(values: Any, count: int) -> bool:
-    """Whether these are finite numbers, as many as wanted."""
-    whole = isinstance(values, list) and len(values) == count
-    return whole and all(type(one) in (int, float) and math.isfinite(one) for one in values)
-
-
-def _listed_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _list_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     files = chunked_files(root / "meta" / "episodes")
     if not files:
         message = "no episodes are listed: never finalised (LeRobotDataset.finalize), or a part"
         raise DatasetError(message, check="missing", file="meta/episodes")
     for path in files:
-        for row in read_columns(path, root, EPISODE_COLUMNS).to_pylist():
+        for row in read_columns(path, root, (*ROW_NUMBERS, "tasks")).to_pylist():
             yield str(path.relative_to(root)), row
 
 
@@ -292,8 +293,7 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
 def _episode(
     info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
 ) -> Episode:
-    whole = [name for name in EPISODE_COLUMNS if name != "tasks"]
-    for name in whole if modern else whole[:2]:
+    for name in ROW_NUMBERS if modern else ROW_NUMBERS[:2]:
         if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
             message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
             raise DatasetError(message, file=place, column=name)
@@ -301,12 +301,14 @@ def _episode(
     tasks = row.get("tasks") or ()
     if not all(isinstance(task, str) for task in tasks):
         raise DatasetError(f"tasks are no text: {tasks!r}", file=place, column="tasks")
-    start = row["dataset_from_index"] if modern else None
-    if modern and (stop := row["dataset_to_index"]) - start != length:
+    if not modern:
+        file = episode_file(info, "data_path", index, None)
+        return Episode(index, length, tuple(tasks), file)
+    start, stop, *numbers = (row[name] for name in ROW_NUMBERS[2:])
+    if stop - start != length:
         message = f"the length is {length} but the rows go from {start} to {stop}"
         raise DatasetError(message, file=place, episode=index)
-    numbers = (row["data/chunk_index"], row["data/file_index"]) if modern else None
-    file = episode_file(info, "data_path", index, numbers)
+    file = episode_file(info, "data_path", index, (numbers[0], numbers[1]))
     return Episode(index, length, tuple(tasks), file, start)
 
 
@@ -317,7 +319,7 @@ def episode_file(
     place: tuple[int, int] | None,
     **texts: str,
 ) -> Path:
-    """The file of an episode, relative to the root, by a template in ``info.json``.
+    """Find the file of an episode, relative to the root, by a template in ``info.json``.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class DataOptions:
         """A ``dataset`` with a robot that has no limits for what is in a unit of its own."""
         from tpgmm_datasets.reader import open_recording
 
-        return open_recording(dataset, **(self.arguments(robot) | options)).unlimited()
+        return open_recording(dataset, **(self.arguments(robot) | options)).drop_raw_limits()
 
     def read(self, dataset: str, robot: Kinematics | None = None) -> list[Demonstration]:
         """The demonstrations in a ``dataset``, joints in the order of a ``robot``."""
