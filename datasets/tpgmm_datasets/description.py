@@ -133,11 +133,7 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
     """
     layout = open_layout(local_folder(path))
     problems = list(layout.problems)
-    features = [
-        feature
-        for key, feature in layout.features.items()
-        if key not in BOOKKEEPING and feature.dtype not in (*CAMERAS, "string")
-    ]
+    features = _list_numeric(layout)
     episodes = read_episodes(layout, layout.episodes, features, problems.append)
     ranges, sums = _summarise_values(episodes)
     joints = _find_joints(layout, problems)
@@ -157,6 +153,12 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
         _share_tracked(layout, sums) if {SEEN, KNOWN} <= sums.keys() else {},
         tuple(problems),
     )
+
+
+def _list_numeric(layout: Layout) -> list[Feature]:
+    """List the columns of numbers that are not LeRobot's own."""
+    features = [item for key, item in layout.features.items() if key not in BOOKKEEPING]
+    return [item for item in features if item.dtype not in (*CAMERAS, "string")]
 
 
 def _find_joints(layout: Layout, problems: list[DatasetError]) -> str | None:

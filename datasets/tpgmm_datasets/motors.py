@@ -141,17 +141,15 @@ def estimate_motor_map(
     names = tuple(robot.joint_names if names is None else names)
     stored = {joint: name for name, joint in match_names(robot.joint_names, names, "").items()}
     motors = [stored[joint] for joint in robot.joint_names]
-    table = _check_postures(as_tensor(values, "values").to(robot.lower), poses, len(names))
-    if not {*known} <= {*motors}:
-        wrong = [motor for motor in known if motor not in motors]
+    table = as_tensor(values, "values").to(robot.lower)
+    _check_postures(table, poses, len(names))
+    if wrong := sorted({*known} - {*motors}):
         raise DatasetError(f"known motors {wrong} are not among {motors}")
     given = units if isinstance(units, Mapping) else dict.fromkeys(names, units)
     scales = {motor: as_scale(given.get(motor, "rad"), motor) for motor in motors}
-    columns = [table[:, names.index(m)] * scales[m].factor + scales[m].offset for m in motors]
-    angles = torch.stack(columns, 1)
-    moves = robot.state(angles).jacobians[:, robot.links.index(link)].abs().amax((0, 1)) > 1e-9
-    moving = torch.nonzero(moves).flatten().tolist()
-    chosen = [i for i in moving if motors[i] not in known]
+    stored_angles = table[:, [names.index(motor) for motor in motors]]
+    angles = _scale_columns(stored_angles, [scales[motor] for motor in motors])
+    chosen = [i for i in _find_moving_joints(robot, link, angles) if motors[i] not in known]
     if not 0 < len(chosen) <= MOST_MOTORS:
         raise DatasetError(
             f"{len(chosen)} motors move the link {link!r}; the map of 1 to {MOST_MOTORS} can "
@@ -162,13 +160,23 @@ def estimate_motor_map(
     return _map_motors([motors[i] for i in chosen], scales, problem)
 
 
-def _check_postures(table: Tensor, poses: Frame, motors: int) -> Tensor:
+def _scale_columns(values: Tensor, scales: Sequence[Scale]) -> Tensor:
+    pairs = zip(values.unbind(1), scales, strict=True)
+    return torch.stack([column * scale.factor + scale.offset for column, scale in pairs], 1)
+
+
+def _find_moving_joints(robot: Kinematics, link: str, joints: Tensor) -> list[int]:
+    jacobians = robot.state(joints).jacobians[:, robot.links.index(link)]
+    moving: list[int] = torch.nonzero(jacobians.abs().amax((0, 1)) > 1e-9).flatten().tolist()
+    return moving
+
+
+def _check_postures(table: Tensor, poses: Frame, motors: int) -> None:
     n = len(poses.position) if poses.batch_shape else 0
     if table.shape != (n, motors) or not n:
         got = f"values {tuple(table.shape)}, poses {tuple(poses.batch_shape)}"
         wanted = f"have the shape (n, {motors}), and there are n poses; got {got}"
         raise DatasetError(f"values of {motors} motors at n postures {wanted}")
-    return table
 
 
 def _map_motors(

@@ -43,7 +43,10 @@ def value_names(
     if not leaves or (len(leaves) == 1 < width and leaves[0][1] in re.split(r"[./]", key)):
         return None, ""
     try:
-        return _flatten(_sort_by_position(leaves), width, distinct), ""
+        leaves = _sort_by_position(leaves)
+        bare = [name for _, name, _ in leaves]
+        _check_names(bare, width)
+        return tuple(_prefix_shared(leaves) if distinct else bare), ""
     except ValueError as problem:
         return None, str(problem)
 
@@ -74,21 +77,21 @@ def _sort_by_position(leaves: list[Leaf]) -> list[Leaf]:
     return sorted(leaves, key=lambda leaf: leaf[2])
 
 
-def _flatten(leaves: list[Leaf], width: int, distinct: bool) -> tuple[str, ...]:
-    """Return a name for each value, that of a group before what several groups have."""
-    bare = [name for _, name, _ in leaves]
-    for name in bare:
+def _check_names(names: list[Any], width: int) -> None:
+    for name in names:
         if not isinstance(name, str) or not name.strip():
-            raise ValueError(f"{name!r} is no name, of {bare}")
-    if len(leaves) != width:
-        raise ValueError(f"{len(leaves)} names for {width} values, {bare}")
-    if not distinct:
-        return tuple(bare)
+            raise ValueError(f"{name!r} is no name, of {names}")
+    if len(names) != width:
+        raise ValueError(f"{len(names)} names for {width} values, {names}")
+
+
+def _prefix_shared(leaves: list[Leaf]) -> list[str]:
+    """Put the group's name before names that several groups have."""
+    bare = [name for _, name, _ in leaves]
     flat = ["_".join((*g, n)) if bare.count(n) > 1 else n for g, n, _ in leaves]
-    for name, whole in zip(bare, flat, strict=True):
-        if flat.count(whole) > 1:
-            raise ValueError(f"{name!r} is there twice, of {bare}")
-    return tuple(flat)
+    if twice := [i for i, name in enumerate(flat) if flat.count(name) > 1]:
+        raise ValueError(f"{bare[twice[0]]!r} is there twice, of {bare}")
+    return flat
 
 
 #: What can be said where names do not match, and where there are none that can be used.

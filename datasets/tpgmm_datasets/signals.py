@@ -82,26 +82,26 @@ class Signals:
         assembly = recording.assembly
         layout, columns = assembly.layout, assembly.joints
         features = {STATE: columns.feature, **layout.features}
-        observed = {key: features[key] for key in (STATE, ACTION) if key in features}
-        names = {k: _name_values(f, columns, joint_names) for k, f in observed.items()}
+        observed = [features[key] for key in (STATE, ACTION) if key in features]
+        names = [_name_values(feature, columns, joint_names) for feature in observed]
         scales = _select_scales(columns, columns.scales, robot)
-        for key, feature in observed.items():
+        for feature, entries in zip(observed, names, strict=True):
             if feature.key != columns.feature.key:
-                _check_units(feature, names[key], scales)
+                _check_units(feature, entries, scales)
         cell = layout.root / CELL
-        there = cell.exists()
-        if there:  # which has the offsets, and a policy adds them
+        if cell.exists():  # which has the offsets, and a policy adds them
             bare = add_offsets(columns.units, None, columns.feature.key)
             scales = _select_scales(columns, bare, robot)
+        sources = frame_sources(layout, frames, recording.episodes)
         environment = layout.features.get(ENVIRONMENT)
         return cls(
             assembly.rate or layout.fps,
-            names[STATE],
-            names.get(ACTION),
+            names[0],
+            names[1] if ACTION in features else None,
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
-            _locate_frames(frame_sources(layout, frames, recording.episodes), environment),
-            cell if there else None,
+            _locate_frames(sources, environment) if environment else {},
+            cell if cell.exists() else None,
         )
 
 
@@ -115,7 +115,7 @@ def _select_scales(
 
 
 def _locate_frames(
-    sources: Mapping[str, Any], environment: Feature | None
+    sources: Mapping[str, Any], environment: Feature
 ) -> dict[str, tuple[int, ...]]:
     """Locate frames that the environment's values hold as position and quaternion."""
     stored = {name: pose for name, pose in sources.items() if isinstance(pose, FramePose)}
@@ -123,7 +123,7 @@ def _locate_frames(
     return {
         name: tuple(pose.select(name, environment))
         for name, pose in stored.items()
-        if environment and (pose.feature, pose.rotation, pose.scale) == form
+        if (pose.feature, pose.rotation, pose.scale) == form
     }
 
 
@@ -131,20 +131,17 @@ def _name_values(
     feature: Feature, columns: JointColumns, joint_names: Any
 ) -> tuple[str, ...] | None:
     """Name values as ``joint_names`` says; those without names are the joints in order."""
-    called = joint_names if isinstance(joint_names, Mapping) else {}
-    source, names = columns.feature, feature.names
-    given = None if called or joint_names is None else columns.names
-    alike = feature.width == source.width
-    _check_names(feature, alike and bool(given))
-    if alike and (names is None or (given and names == source.names)):
-        names = given or source.names
-    return names and tuple(called.get(name, name) for name in names)
-
-
-def _check_names(feature: Feature, given: bool) -> None:
-    if feature.misnamed and not given:
+    if joint_names is None or (joint_names and isinstance(joint_names, Mapping)):
+        given, called = None, joint_names or {}
+    else:
+        given, called = columns.names, {}
+    names, alike = feature.names, feature.width == columns.feature.width
+    if feature.misnamed and not (alike and given):
         message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
         raise DatasetError(message, column=feature.key)
+    if alike and names in (None, columns.feature.names):
+        names = given or columns.feature.names
+    return names and tuple(called.get(name, name) for name in names)
 
 
 def _check_units(

@@ -191,20 +191,18 @@ def _check_angles(
 
     Grippers are of any unit, and say nothing of the others.
     """
-    others = [
-        f"{name!r} is said to be in {unit!r}"
-        for name, unit in zip(names, units, strict=True)
-        if _is_angular(unit) and not is_gripper(name)
-    ]
-    unsure, small, refuse_all = list[str](), list[str](), bool(others)
+    others, large, small = list[str](), list[str](), list[str]()
+    only_grippers = True
     for name, unit, low, high in zip(names, units, values.min(0), values.max(0), strict=True):
         span = f"{name!r} (from {low:.4g} to {high:.4g}"
-        if unit == "auto" and max(abs(low), abs(high)) > LARGEST_ANGLE:
-            unsure.append(f"{span}: {guess_unit(low, high)}?)")
-            refuse_all |= not is_gripper(name)
-        elif unit == "auto":
+        if unit != "auto":
+            others += [f"{name!r} is said to be in {unit!r}"] * _is_angular(unit, name)
+        elif max(abs(low), abs(high)) > LARGEST_ANGLE:
+            large.append(f"{span}: {guess_unit(low, high)}?)")
+            only_grippers &= is_gripper(name)
+        else:
             small.append(f"{span}: not either)")
-    unsure += small if refuse_all else []
+    unsure = large if only_grippers and not others else large + small
     if unsure:
         because = f", because {others[0]} and joints have one unit" if others else ""
         message = (
@@ -217,9 +215,10 @@ def _check_angles(
         raise UnknownUnitsError(message, column=column, **where)
 
 
-def _is_angular(unit: Unit) -> bool:
-    """Check if a unit says that the joints of the feature are not in radians."""
-    return unit == "deg" or (isinstance(unit, Scale) and unit.factor != 1)
+def _is_angular(unit: Unit, name: str) -> bool:
+    """Check if a unit says that the joints of the feature, no grippers, are not in radians."""
+    scaled = unit == "deg" or (isinstance(unit, Scale) and unit.factor != 1)
+    return scaled and not is_gripper(name)
 
 
 def as_scale(unit: Unit, column: str) -> Scale:
@@ -300,7 +299,7 @@ def units_of(
     """
     given = units if isinstance(units, Mapping) else {"*": units}
     called = list(zip(stored, final, strict=True))
-    fitting = {k: [i for i, names in enumerate(called) if fits(k, *names)] for k in given}
+    fitting = {key: _find_places(key, called) for key in given}
     if unknown := [key for key, places in fitting.items() if not places]:
         there = f"which fit no value; they are called {list(dict.fromkeys(stored))}"
         raise DatasetError(f"units names {unknown}, {there}", column=column)
@@ -309,6 +308,10 @@ def units_of(
         for place in fitting[key]:
             chosen[place] = _resolve_lerobot(given[key], *called[place], robot)
     return chosen
+
+
+def _find_places(pattern: str, called: Sequence[tuple[str, str]]) -> list[int]:
+    return [i for i, names in enumerate(called) if fits(pattern, *names)]
 
 
 def _resolve_lerobot(unit: Unit, stored: str, name: str, robot: Any) -> Unit:

@@ -217,7 +217,7 @@ def add_frames(
     path, out = local_folder(path), Path(out)
     layout = open_to_copy(path, out)
     sources = frame_sources(layout, frames, layout.episodes)
-    if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
+    if {*map(type, sources.values())} != {MeasuredPoses}:
         raise DatasetError(
             f"a table (NAME=POSES.csv) or frames by episode can be added, got {dict(frames)}; "
             "LINK@EVENT and features are learned from the set as it is"

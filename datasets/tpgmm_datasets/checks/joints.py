@@ -167,17 +167,16 @@ def _check_plateaus(
 ) -> Iterator[Finding]:
     """Find ends of a range that are run into and left at full speed more than once."""
     ends: dict[tuple[str, float], list[int]] = {}
-    plateaus = [(i, *plateau) for i, one in enumerate(episodes) for plateau in one.plateaus]
-    for index, joint, value, _ in plateaus:
-        if joint in angles:
-            ends.setdefault((names[joint], value), []).append(index)
-    odd = {end: indices for end, indices in ends.items() if len(indices) > 1}
-    if odd:
+    for index, episode in enumerate(episodes):
+        for joint, value, _ in episode.plateaus:
+            if joint in angles:
+                ends.setdefault((names[joint], value), []).append(index)
+    if odd := {end: indices for end, indices in ends.items() if len(indices) > 1}:
         places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
         message = f"motions stop dead at one value and go on from it: {listed(places)}"
         remedy = "Was the recording cut off at a limit, or a sensor saturated?"
-        about = sorted({index for indices in odd.values() for index in indices})
-        joints = dict.fromkeys(name for name, _ in odd)
+        about = sorted(set().union(*odd.values()))
+        joints = dict.fromkeys(next(zip(*odd, strict=True)))
         yield Finding("clipped", message, remedy, tuple(joints), tuple(about))
 
 

@@ -100,27 +100,26 @@ def event_sources(
         name: parse_event(source) if isinstance(source, str) else source
         for name, source in (events or {}).items()
     }
-    at_links = {n: (p.link, p.event) for n, p in frames.items() if isinstance(p, LinkPose)}
     usual: dict[str, Detector] = {}
-    for name, (link, event) in at_links.items():
-        if not isinstance(event, str) or event in sources or event in stored:
+    for name, pose in frames.items():
+        if not isinstance(pose, LinkPose) or pose.event in (*sources, *stored):
             continue
-        detector = _find_usual_event(name, event, link, names or ())
+        event, detector = str(pose.event), _find_usual_event(name, pose, names or ())
         if detector is not None and usual.setdefault(event, detector) != detector:
             raise DatasetError(
-                f"frame {name!r}: {event!r} of {link!r} is another event than of the other "
-                f"links; call it otherwise: events={{'{event}_{link}': 'closing:SIGNAL'}}"
+                f"frame {name!r}: {event!r} of {pose.link!r} is another event than of the "
+                f"other links; call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
             )
     return sources | usual
 
 
-def _find_usual_event(
-    frame: str, event: str, link: str, names: Sequence[str]
-) -> Detector | None:
+def _find_usual_event(frame: str, pose: LinkPose, names: Sequence[str]) -> Detector | None:
+    if not isinstance(pose.event, str):
+        return None
     try:
-        return usual_event(event, link, names)
+        return usual_event(pose.event, pose.link, names)
     except DataError as error:
-        message = f"frame {frame!r}: event {event!r} is not in the data set, and {error}"
+        message = f"frame {frame!r}: event {pose.event!r} is not in the data set, and {error}"
         raise DatasetError(message) from error
 
 

@@ -147,7 +147,7 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
         names = _rename_values(feature, given or {})
     else:
         names = (given,) if isinstance(given, str) else tuple(given)
-    if names is not None and (len(names) != count or len(set(names)) < count):
+    if names is not None and not len(names) == len({*names}) == count:
         message = f"joint_names must give {count} different names, got {len(names)}: {names}"
         raise DatasetError(message, column=feature.key)
     return names if robot is None else _match_robot(feature, names, robot)
@@ -187,13 +187,13 @@ def _choose_units(
     declared = feature.units or ("auto",) * feature.width
     chosen = units_of(units, stored, final, robot, feature.key)
     differing, resolved = list[str](), list[Unit]()
-    joints = {*(final if robot is None else robot.joint_names)}
+    joints = getattr(robot, "joint_names", final)
     for name, joint, given, known in zip(stored, final, chosen, declared, strict=True):
         if _differ(given, known, feature.key):
             differing.append(f"{name!r} in {known!r}, not {given!r}")
-        unit = known if given == "auto" else given
         # values of no joint are only seen by functions that find events
-        resolved.append("raw" if unit == "auto" and joint not in joints else unit)
+        unknown = "auto" if joint in joints else "raw"
+        resolved.append(next((unit for unit in (given, known) if unit != "auto"), unknown))
     if differing:
         differ = f"the set declares {', '.join(differing)}; what was given counts"
         warnings.warn(f"column {feature.key!r}: {differ}", DatasetWarning, stacklevel=2)

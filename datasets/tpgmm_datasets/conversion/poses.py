@@ -323,16 +323,22 @@ def _find_pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str
             wrong.append(column)
         elif ours:
             found[part] = column, factor
-    ordered = [p for p in WRITTEN if {*p.split(), "episode"} == {*found} - {"time"}]
-    if wrong or not ordered:
+    ordered = _find_form(found)
+    if wrong or ordered is None:
         strange = f", and {wrong} are unknown or there twice" if wrong else ""
         raise DataError(
             f"the table has columns {list(columns)}{strange}. Name them episode, x, y, z (or "
             f"{name}.x, ...), and yaw, or qw, qx, qy, qz; time if it moves; x_mm or yaw_deg in "
             "other units. Leave others out"
         )
-    parts = ("episode", "time", *ordered[0].split())
-    return {part: found[part] for part in parts if part in found}
+    parts = ("episode", "time", *ordered.split())
+    return {part: found[part] for part in sorted(found, key=parts.index)}
+
+
+def _find_form(parts: Collection[str]) -> str | None:
+    """Find the parts in the order of a form that poses are written in."""
+    forms = {frozenset(form.split()): form for form in WRITTEN}
+    return forms.get(frozenset(parts) - {"episode", "time"}) if "episode" in parts else None
 
 
 def _check_units(values: Array, parts: Sequence[str]) -> None:

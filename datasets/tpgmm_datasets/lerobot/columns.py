@@ -157,12 +157,11 @@ def demonstration_columns(
         columns[ENVIRONMENT] = np.concatenate(poses, axis=1)
     for link, wrench in demonstration.wrenches.items():
         columns[WRENCH + link] = as_array(wrench)
-    for key in (key for key in features if key.startswith(EVENT)):
-        columns[key] = _flag_event(demonstration, key.removeprefix(EVENT), fps)
+    columns |= {k: _flag_event(demonstration, k, fps) for k in features if k.startswith(EVENT)}
     columns["timestamp"] = grid[:, None]
     columns["frame_index"] = np.arange(steps)[:, None]
-    kinds = {key: features[key]["dtype"] for key in features if key in columns}
-    return {key: _cast(columns[key], kind, key, number) for key, kind in kinds.items()}
+    keys = [key for key in features if key in columns]
+    return {key: _cast(columns[key], features[key]["dtype"], key, number) for key in keys}
 
 
 def _check_grid(demonstration: Demonstration, number: int, fps: float) -> Array:
@@ -206,7 +205,8 @@ def pose_values(frame: Frame, rows: int) -> Array:
     return np.broadcast_to(pose, (rows, len(POSE_PARTS)))
 
 
-def _flag_event(demonstration: Demonstration, event: str, fps: float) -> Array:
+def _flag_event(demonstration: Demonstration, column: str, fps: float) -> Array:
+    event = column.removeprefix(EVENT)
     flag = np.zeros((len(demonstration), 1), dtype=bool)
     if event in demonstration.events:
         since = demonstration.events[event] - float(demonstration.time[0])

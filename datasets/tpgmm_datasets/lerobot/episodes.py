@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,32 +103,40 @@ def read_episodes(
 def _read_file(
     layout: Layout, episodes: Sequence[Episode], features: Sequence[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
-    file, keys = episodes[0].file, [feature.key for feature in features]
+    file, needed = episodes[0].file, ["episode_index", *(feature.key for feature in features)]
     expected = {episode.index: episode for episode in episodes}
     listed = {one.index: one.length for one in layout.episodes if one.file == file}
-    seen: set[int] = set()
-    path, needed = layout.root / file, ["episode_index", *keys]
-    with open_parquet(path, layout.root, needed, BOOKKEEPING) as parquet:
+    with open_parquet(layout.root / file, layout.root, needed, BOOKKEEPING) as parquet:
         schema = parquet.schema_arrow
         for problem in _compare_declarations(layout, file, schema.metadata or {}):
             policy(problem)
-        counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
+        counters = {name for name in BOOKKEEPING[:4] if name in schema.names}
         values = len(counters) + sum(feature.width for feature in features)
         _check_size(file, parquet.metadata.num_rows, values, listed.values())
-        columns = list(dict.fromkeys([*counters, *keys]))
-        for index, table in episode_tables(parquet, file, columns):
-            if index in seen:
-                message = "its rows are there twice, or are not together"
-                policy(DatasetError(message, check="duplicates", file=file, episode=index))
-            elif index in expected:
-                yield from _rows(layout, expected[index], table, features, policy)
-            elif index not in listed:
-                message = "the metadata do not list it in this file"
-                policy(DatasetError(message, check="metadata", file=file, episode=index))
-            seen.add(index)
-    for index in sorted(set(expected) - seen):
-        message = f"the metadata list it with {expected[index].length} rows, the file has none"
+        tables = episode_tables(parquet, file, sorted(counters.union(needed)))
+        for index, table in _check_listing(tables, file, listed, policy):
+            if episode := expected.pop(index, None):
+                yield from _read_rows(layout, episode, table, features, policy)
+    for index, episode in sorted(expected.items()):
+        message = f"the metadata list it with {episode.length} rows, the file has none"
         policy(DatasetError(message, check="metadata", file=file, episode=index))
+
+
+def _check_listing(
+    tables: Iterable[tuple[int, pa.Table]], file: Path, listed: Collection[int], policy: Policy
+) -> Iterator[tuple[int, pa.Table]]:
+    """Yield the rows of episodes that the metadata list in a file, those of each once."""
+    seen: set[int] = set()
+    for index, table in tables:
+        if index in seen:
+            message = "its rows are there twice, or are not together"
+            policy(DatasetError(message, check="duplicates", file=file, episode=index))
+        elif index not in listed:
+            message = "the metadata do not list it in this file"
+            policy(DatasetError(message, check="metadata", file=file, episode=index))
+        else:
+            yield index, table
+        seen.add(index)
 
 
 def _check_size(file: Path, rows: int, values: int, lengths: Collection[int]) -> None:
@@ -163,7 +171,7 @@ def _compare_declarations(
             yield DatasetError(message, check="metadata", file=file, column=name)
 
 
-def _rows(
+def _read_rows(
     layout: Layout,
     episode: Episode,
     table: pa.Table,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -240,7 +240,7 @@ def _features(info: Mapping[str, Any]) -> dict[str, Feature]:
 
 
 def _feature(key: str, entry: Any) -> Feature:
-    entry = entry if isinstance(entry, dict) else {}
+    entry = _as_dict(entry)
     dtype, shape = entry.get("dtype"), entry.get("shape")
     sizes: list[Any] = shape if isinstance(shape, list) else [None]
     if not isinstance(dtype, str) or not all(type(n) is int and n > 0 for n in sizes):
@@ -250,7 +250,7 @@ def _feature(key: str, entry: Any) -> Feature:
     if width > MOST_VALUES and dtype not in CAMERAS:
         message = f"a row has {width} values ({shape!r}); at most {MOST_VALUES} are read"
         raise DatasetError(message, file=INFO, column=key)
-    extra = about if isinstance(about := entry.get("info"), dict) else {}
+    extra = _as_dict(entry.get("info"))
     names, misnamed = value_names(entry.get("names"), width, key)
     units, wrong = value_names(extra.get("units"), width, distinct=False)
     if wrong:
@@ -258,6 +258,10 @@ def _feature(key: str, entry: Any) -> Feature:
         raise DatasetError(message, file=INFO, column=key)
     offsets = _parse_offsets(extra.get("offsets"), width, key)
     return Feature(key, dtype, tuple(sizes), names, units, misnamed, offsets)
+
+
+def _as_dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _parse_offsets(offsets: Any, width: int, key: str) -> tuple[float, ...] | None:
@@ -293,10 +297,7 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
 def _episode(
     info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
 ) -> Episode:
-    for name in ROW_NUMBERS if modern else ROW_NUMBERS[:2]:
-        if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
-            message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
-            raise DatasetError(message, file=place, column=name)
+    _check_numbers(row, ROW_NUMBERS if modern else ROW_NUMBERS[:2], place)
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
     if not all(isinstance(task, str) for task in tasks):
@@ -310,6 +311,13 @@ def _episode(
         raise DatasetError(message, file=place, episode=index)
     file = episode_file(info, "data_path", index, (numbers[0], numbers[1]))
     return Episode(index, length, tuple(tasks), file, start)
+
+
+def _check_numbers(row: Mapping[str, Any], names: Sequence[str], place: str) -> None:
+    for name in names:
+        if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
+            message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
+            raise DatasetError(message, file=place, column=name)
 
 
 def episode_file(

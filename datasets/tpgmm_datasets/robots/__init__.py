@@ -161,12 +161,11 @@ def end_links(model: UrdfModel) -> tuple[str, ...]:
     >>> end_links(parse_robot("so101").model)
     ('gripper_frame_link',)
     """
-    parents = {joint.child: joint.parent for joint in model.joints}
     carriers = {joint.parent for joint in model.movable.values() if is_gripper(joint.name)}
     carriers |= {link for link in model.links if HAND.fullmatch(link)}
-    ordered = [link for link in model.links if link in carriers]
-    below = {link for link in carriers if _is_below(link, carriers, parents)}
-    return tuple(_find_tip(link, model) for link in ordered if link not in below)
+    parents = {joint.child: joint.parent for joint in model.joints}
+    highest = {link for link in carriers if not _is_below(link, carriers, parents)}
+    return tuple(_find_tip(link, model) for link in model.links if link in highest)
 
 
 def _is_below(link: str, wanted: Collection[str], parents: Mapping[str, str]) -> bool:
