@@ -66,7 +66,7 @@ class EpisodeBatches:
         self.size, self._recording = size, replace(recording, episodes=episodes)
 
     def __len__(self) -> int:
-        """Number of batches."""
+        """Return the number of batches."""
         return -(-len(self._recording.episodes) // self.size)
 
     def __iter__(self) -> Iterator[list[Demonstration]]:

@@ -139,30 +139,32 @@ def estimate_motor_map(
     (-1, 20.0)
     """
     names = tuple(robot.joint_names if names is None else names)
-    stored = {joint: name for name, joint in match_names(robot.joint_names, names, "").items()}
-    motors = [stored[joint] for joint in robot.joint_names]
+    matched = match_names(robot.joint_names, names, "")
+    motors = sorted(matched, key=lambda name: robot.joint_names.index(matched[name]))
     table = as_tensor(values, "values").to(robot.lower)
     _check_postures(table, poses, len(names))
     if wrong := sorted({*known} - {*motors}):
         raise DatasetError(f"known motors {wrong} are not among {motors}")
     given = units if isinstance(units, Mapping) else dict.fromkeys(names, units)
     scales = {motor: as_scale(given.get(motor, "rad"), motor) for motor in motors}
-    stored_angles = table[:, [names.index(motor) for motor in motors]]
-    angles = _scale_columns(stored_angles, [scales[motor] for motor in motors])
+    angles = _scale_values(table, names, scales)
     chosen = [i for i in _find_moving_joints(robot, link, angles) if motors[i] not in known]
     if not 0 < len(chosen) <= MOST_MOTORS:
         raise DatasetError(
             f"{len(chosen)} motors move the link {link!r}; the map of 1 to {MOST_MOTORS} can "
             "be estimated at once: take one arm, or say which are known, known=[...]"
         )
-    std = position_std, orientation_std if orientations else math.inf
-    problem = _Problem(robot, link, angles, chosen, poses.to(table), *std)
+    turn_std = orientation_std if orientations else math.inf
+    problem = _Problem(robot, link, angles, chosen, poses.to(table), position_std, turn_std)
     return _map_motors([motors[i] for i in chosen], scales, problem)
 
 
-def _scale_columns(values: Tensor, scales: Sequence[Scale]) -> Tensor:
-    pairs = zip(values.unbind(1), scales, strict=True)
-    return torch.stack([column * scale.factor + scale.offset for column, scale in pairs], 1)
+def _scale_values(values: Tensor, names: Sequence[str], scales: Mapping[str, Scale]) -> Tensor:
+    columns = [
+        values[:, names.index(motor)] * scale.factor + scale.offset
+        for motor, scale in scales.items()
+    ]
+    return torch.stack(columns, 1)
 
 
 def _find_moving_joints(robot: Kinematics, link: str, joints: Tensor) -> list[int]:

@@ -29,10 +29,10 @@ from tpgmm_datasets.events import doubtful_events
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
-from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
+from tpgmm_datasets.lerobot.stored_signals import event_features
 from tpgmm_datasets.units import Scale, Unit, Units, fits
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
@@ -130,7 +130,7 @@ class Recording:
         return replace(self, assembly=replace(self.assembly, robot=robot.unlimited(raw)))
 
     def _report(self, summaries: Sequence[RecordingSummary]) -> Report:
-        """Findings and doubtful events."""
+        """Report findings and doubtful events."""
         robot, raw = self.assembly.robot, self.assembly.joints.raw
         known = robot if isinstance(robot, Kinematics) else None
         report = check_summaries(summaries, known, raw)

@@ -82,12 +82,8 @@ class Signals:
         assembly = recording.assembly
         layout, columns = assembly.layout, assembly.joints
         features = {STATE: columns.feature, **layout.features}
-        observed = [features[key] for key in (STATE, ACTION) if key in features]
-        names = [_name_values(feature, columns, joint_names) for feature in observed]
         scales = _select_scales(columns, columns.scales, robot)
-        for feature, entries in zip(observed, names, strict=True):
-            if feature.key != columns.feature.key:
-                _check_units(feature, entries, scales)
+        names = _name_entries(features, columns, joint_names, scales)
         cell = layout.root / CELL
         if cell.exists():  # which has the offsets, and a policy adds them
             bare = add_offsets(columns.units, None, columns.feature.key)
@@ -96,8 +92,8 @@ class Signals:
         environment = layout.features.get(ENVIRONMENT)
         return cls(
             assembly.rate or layout.fps,
-            names[0],
-            names[1] if ACTION in features else None,
+            names[STATE],
+            names.get(ACTION),
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
             _locate_frames(sources, environment) if environment else {},
@@ -127,21 +123,37 @@ def _locate_frames(
     }
 
 
-def _name_values(
-    feature: Feature, columns: JointColumns, joint_names: Any
-) -> tuple[str, ...] | None:
-    """Name values as ``joint_names`` says; those without names are the joints in order."""
+def _name_entries(
+    features: Mapping[str, Feature],
+    columns: JointColumns,
+    joint_names: Any,
+    scales: Mapping[str, Scale],
+) -> dict[str, tuple[str, ...] | None]:
+    """Name the entries of states and actions as ``joint_names`` says, and check their units."""
     if joint_names is None or (joint_names and isinstance(joint_names, Mapping)):
         given, called = None, joint_names or {}
     else:
         given, called = columns.names, {}
-    names, alike = feature.names, feature.width == columns.feature.width
+    names = {}
+    for key in sorted(features.keys() & {STATE, ACTION}, reverse=True):  # states first
+        entries = _find_names(features[key], columns.feature, given)
+        names[key] = entries and tuple(called.get(name, name) for name in entries)
+        if features[key].key != columns.feature.key:
+            _check_units(features[key], names[key], scales)
+    return names
+
+
+def _find_names(
+    feature: Feature, source: Feature, given: tuple[str, ...] | None
+) -> tuple[str, ...] | None:
+    """Find the names of values; those without names are the joints in order."""
+    alike = feature.width == source.width
     if feature.misnamed and not (alike and given):
         message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
         raise DatasetError(message, column=feature.key)
-    if alike and names in (None, columns.feature.names):
-        names = given or columns.feature.names
-    return names and tuple(called.get(name, name) for name in names)
+    if alike and feature.names in (None, source.names):
+        return given or source.names
+    return feature.names
 
 
 def _check_units(

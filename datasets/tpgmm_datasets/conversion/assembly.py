@@ -16,9 +16,13 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.events import Detector, parse_event, usual_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
-from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout
-from tpgmm_datasets.lerobot.wrenches import stored_wrenches, wrench_features
+from tpgmm_datasets.lerobot.stored_signals import (
+    event_features,
+    flagged_events,
+    stored_wrenches,
+    wrench_features,
+)
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -28,7 +32,7 @@ from tpgmm_torch.training.hold_detection import holding_as_in
 
 __all__ = [
     "Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources",
-    "stored_frames",
+    "stored_frames"
 ]  # fmt: skip
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
@@ -106,10 +110,9 @@ def event_sources(
             continue
         event, detector = str(pose.event), _find_usual_event(name, pose, names or ())
         if detector is not None and usual.setdefault(event, detector) != detector:
-            raise DatasetError(
-                f"frame {name!r}: {event!r} of {pose.link!r} is another event than of the "
-                f"other links; call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
-            )
+            another = f"{event!r} of {pose.link!r} is another event than of the other links"
+            remedy = f"call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
+            raise DatasetError(f"frame {name!r}: {another}; {remedy}")
     return sources | usual
 
 

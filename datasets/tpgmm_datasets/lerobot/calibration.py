@@ -31,7 +31,7 @@ REMEDY = (
 
 
 def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[str, Scale]:
-    """The scales of recorded values that a calibration tells.
+    """Read the scales of recorded values that a calibration tells.
 
     The angle 0 is the middle of a motor's range, as in LeRobot's degrees.
 

@@ -76,7 +76,7 @@ class Relaxed:
         self.problems.append(problem)
 
     def warn(self) -> None:
-        """Tell of the problems that were kept since, those that are alike as one."""
+        """Warn of the problems that were kept since, those that are alike as one."""
         for text in list_problems(self.problems):
             # the caller is some levels up, how many depends on the way
             warnings.warn(f"left out or not checked: {text}", DatasetWarning, stacklevel=3)
@@ -108,15 +108,15 @@ def _read_file(
     listed = {one.index: one.length for one in layout.episodes if one.file == file}
     with open_parquet(layout.root / file, layout.root, needed, BOOKKEEPING) as parquet:
         schema = parquet.schema_arrow
-        for problem in _compare_declarations(layout, file, schema.metadata or {}):
+        for problem in _compare_declarations(layout, file, schema.metadata):
             policy(problem)
-        counters = {name for name in BOOKKEEPING[:4] if name in schema.names}
+        counters = set(BOOKKEEPING[:4]).intersection(schema.names)
         values = len(counters) + sum(feature.width for feature in features)
         _check_size(file, parquet.metadata.num_rows, values, listed.values())
         tables = episode_tables(parquet, file, sorted(counters.union(needed)))
         for index, table in _check_listing(tables, file, listed, policy):
-            if episode := expected.pop(index, None):
-                yield from _read_rows(layout, episode, table, features, policy)
+            if index in expected:
+                yield from _read_rows(layout, expected.pop(index), table, features, policy)
     for index, episode in sorted(expected.items()):
         message = f"the metadata list it with {episode.length} rows, the file has none"
         policy(DatasetError(message, check="metadata", file=file, episode=index))
@@ -152,10 +152,10 @@ def _check_size(file: Path, rows: int, values: int, lengths: Collection[int]) ->
 
 
 def _compare_declarations(
-    layout: Layout, file: Path, metadata: Mapping[bytes, bytes]
+    layout: Layout, file: Path, metadata: Mapping[bytes, bytes] | None
 ) -> Iterator[DatasetError]:
     """Yield differences between ``info.json`` and what our writer left in the data file."""
-    if METADATA_KEY not in metadata:
+    if not metadata or METADATA_KEY not in metadata:
         return
     try:
         declared = json.loads(metadata[METADATA_KEY])

@@ -13,7 +13,7 @@ import typer
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.lerobot.columns import EVENT
-from tpgmm_datasets.lerobot.event_flags import event_features
+from tpgmm_datasets.lerobot.stored_signals import event_features
 from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
 from tpgmm_datasets.units import Scale
