@@ -78,10 +78,10 @@ def test_a_frame_is_constant_or_moves_and_is_chosen_by_place_or_name(root):
     ],
 )
 def test_a_frame_that_does_not_fit_its_feature_is_refused(root, pose, message):
-    def spoiled(values):
+    def double(values):
         return values * 2
 
-    change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", spoiled))
+    change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", double))
     with pytest.raises(DatasetError, match=message):
         load_lerobot(root, frames={"bottle": pose})
 

@@ -39,7 +39,7 @@ def arm(root):
 
 
 def read_by_lerobot(ticks, mode):
-    """What LeRobot stores of ticks, by its own motor bus."""
+    """Normalise ticks as LeRobot stores them, by its own motor bus."""
     bus = FeetechMotorsBus.__new__(FeetechMotorsBus)  # without a port
     motors = {
         name: Motor(i, "sts3215", MotorNormMode.RANGE_0_100 if name == "gripper" else mode)

@@ -58,13 +58,13 @@ def test_numbers_that_are_more_precise_than_declared_are_read(root, tmp_path):
     change_info(plain, lambda i: i["features"][STATE].update(dtype="float32"))
     assert_equal(joints_of(load_lerobot(plain)), expected)
 
-    def rounded(table):
+    def round_state(table):
         values = table[STATE].combine_chunks().cast(pa.list_(pa.float32(), 3))
         return set_column(table, STATE, values)
 
     change_info(plain, lambda i: i["features"][STATE].update(dtype="float64"))
     for file in sorted((plain / "data").rglob("*.parquet")):
-        change_table(plain, file.relative_to(plain), rounded)
+        change_table(plain, file.relative_to(plain), round_state)
     with pytest.raises(DatasetError, match=r"it holds float, info\.json declares float64"):
         load_lerobot(plain)
 
