@@ -15,20 +15,7 @@ from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.pose_names import is_gripper
 
-__all__ = [
-    "LARGEST_ANGLE",
-    "POSE_UNITS",
-    "Scale",
-    "Unit",
-    "Units",
-    "add_offsets",
-    "as_scale",
-    "convert",
-    "fits",
-    "guess_unit",
-    "units_of",
-    "with_pose_units",
-]
+__all__ = ["Scale", "Unit", "Units"]
 
 
 @dataclass(frozen=True)

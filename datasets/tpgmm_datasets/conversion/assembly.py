@@ -30,10 +30,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import holding_as_in
 
-__all__ = [
-    "Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources",
-    "stored_frames"
-]  # fmt: skip
+__all__ = ["Assembly", "EventSource", "FrameSource"]
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]

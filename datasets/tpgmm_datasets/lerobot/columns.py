@@ -34,15 +34,7 @@ from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 
-__all__ = [
-    "action_column",
-    "demonstration_columns",
-    "feature_table",
-    "features_of",
-    "frame_columns",
-    "pose_values",
-    "with_frames",
-]
+__all__ = ["features_of", "with_frames"]
 
 
 Array = np.ndarray[Any, Any]

@@ -16,9 +16,7 @@ from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.layout import Feature, Layout, open_layout
 
-__all__ = [
-    "event_features", "flagged_events", "stored_events", "stored_wrenches", "wrench_features",
-]  # fmt: skip
+__all__ = ["event_features", "stored_events"]
 
 
 def event_features(layout: Layout) -> list[Feature]:
