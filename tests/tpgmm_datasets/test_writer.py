@@ -121,10 +121,7 @@ def test_wrong_arguments_are_refused_and_leave_nothing(tmp_path, change, message
     with pytest.raises(DatasetError, match=message):
         save_lerobot([demonstration()], tmp_path / "set", **arguments)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_folder_is_not_overwritten(tmp_path):
-    with pytest.raises(DatasetError, match="append=True"):
+    with pytest.raises(DatasetError, match="append=True"):  # the folder exists
         save_lerobot([demonstration()], tmp_path, fps=FPS, task="reach")
 
 

@@ -114,17 +114,15 @@ def test_what_is_no_calibration_of_the_set_is_refused(arm, file, content, messag
         load_lerobot(arm, joints="arm", calibration=file)
 
 
-@pytest.mark.parametrize("calibration", [3, {"left_": None}])
-def test_a_calibration_is_a_file_or_several_by_prefix(arm, calibration):
-    with pytest.raises(DatasetError, match="several by prefix; got"):
-        load_lerobot(arm, joints="arm", calibration=calibration)
-
-
 def test_values_in_degrees_and_units_for_all_are_refused(arm, file):
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda values: 1.2 * values))
     with pytest.raises(DatasetError, match=r"goes from -120 to .*use_degrees.*units='deg'"):
         load_lerobot(arm, joints="arm", calibration=file)
-    with pytest.raises(DatasetError, match="give one of them"):
-        load_lerobot(arm, joints="arm", calibration=file, units="deg")
-    with pytest.raises(DatasetError, match=r"cannot be read: .*leg\.json"):
-        load_lerobot(arm, joints="arm", calibration=file.with_name("leg.json"))
+    for options, told in (
+        ({"calibration": file, "units": "deg"}, "give one of them"),
+        ({"calibration": file.with_name("leg.json")}, r"cannot be read: .*leg\.json"),
+        ({"calibration": 3}, "several by prefix; got"),
+        ({"calibration": {"left_": None}}, "several by prefix; got"),
+    ):
+        with pytest.raises(DatasetError, match=told):
+            load_lerobot(arm, joints="arm", **options)
