@@ -31,7 +31,7 @@ class ColumnInfo(Feature):
     key, dtype : str
         Name and type.
     shape : tuple of int
-        Of a row's value.
+        Shape of a row's value.
     names : tuple of str or None
         One per value, where the metadata give them so that they can be used.
     units : tuple of str or None
@@ -68,7 +68,7 @@ class DatasetInfo:
     joints : str or None
         The column that ``load_lerobot`` takes for the joints.
     frames, events : tuple of str
-        Those that it finds by itself.
+        Frames and events that ``load_lerobot`` finds by itself.
     tasks : tuple of str
         All tasks.
     lengths : tuple of int

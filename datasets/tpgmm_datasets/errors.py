@@ -31,7 +31,7 @@ class DatasetError(DataError):
     message : str
         What is wrong and what to do.
     check : str, optional
-        Which of :data:`CHECKS` failed; empty for what cannot be relaxed.
+        Name of the check in :data:`CHECKS` that failed; empty for what cannot be relaxed.
     file : str or Path, optional
         The file it was found in, relative to the data set.
     episode : int, optional
@@ -85,7 +85,7 @@ def list_problems(problems: Iterable[DatasetError]) -> list[str]:
     Parameters
     ----------
     problems : iterable of DatasetError
-        Of one or several episodes.
+        Problems of one or several episodes.
 
     Returns
     -------

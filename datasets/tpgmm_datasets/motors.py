@@ -103,7 +103,7 @@ def estimate_motor_map(
         Where the link was, n_postures poses in the robot's base frame: tracked, or known since
         the link was put there.
     names : sequence of str, optional
-        Of the motors as they are recorded, ``shoulder_pan.pos`` for the joint
+        Names of the motors as they are recorded, ``shoulder_pan.pos`` for the joint
         ``shoulder_pan``; the default is the robot's names in its order.
     units : str, Scale, or mapping of name to these, default="rad"
         What makes angles of the values, up to the sign and the zero: "deg", a

@@ -28,7 +28,7 @@ def value_names(
     width : int
         How many values the feature has.
     key : str
-        Of the feature: a list of nothing but its last word names no value.
+        Name of the feature: a list of nothing but its last word names no value.
     distinct : bool, default=True
         Whether each may be there once only.
 

@@ -55,7 +55,7 @@ class Recording:
     Parameters
     ----------
     episodes : tuple of Episode
-        Which are wanted, in order.
+        Episodes that are wanted, in order.
     assembly : Assembly
         What a demonstration is made of.
     relax : collection of str
@@ -346,7 +346,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         by its name) and ``stop`` where a frame is at them. What is found without confidence is
         no event, and named in the warning.
     episodes : slice, sequence of int, or str, optional
-        Which: of all in order, by index, or those of a task. The default is all.
+        Episodes to read: a slice of all, by index, or those of a task. The default is all.
     rate : float, optional
         Resample to this many steps per second.
     trim : float, optional

@@ -108,7 +108,7 @@ def trajectories_to_frame(
     Parameters
     ----------
     trajectories : sequence of Trajectory
-        Of one model.
+        Trajectories of one model.
     frames : sequence of mapping of str to Frame, optional
         The frames of the situation of each, constant or one per time step.
 
@@ -211,7 +211,7 @@ def write_table(table: pd.DataFrame, path: str | Path) -> None:
     Parameters
     ----------
     table : pandas.DataFrame
-        Of any of these functions.
+        Table from any of these functions.
     path : str or Path
         Ends in .csv, which has all digits, or .parquet. In a .csv a quote stands before names
         that spreadsheets would take for a formula.

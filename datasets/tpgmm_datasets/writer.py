@@ -156,7 +156,7 @@ class Column:
     Parameters
     ----------
     names : sequence of str
-        Of its values.
+        Names of its values.
     values : dict of int to ndarray of shape (T, width)
         By the episode's index; one type for all.
     """

@@ -215,7 +215,7 @@ class BottleShaking(BottleSkill):
     rate : float, default=100.0
         Time steps per second.
     amplitude : float, default=0.25
-        Of the shoulders while shaking [rad]; each demonstration's differs by up to 5 %.
+        Swing of the shoulders while shaking [rad]; each demonstration differs by up to 5 %.
     cycles : float, default=3.0
         Periods of the shaking, in nominally 4.5 s.
     stretch : float, default=0.18
@@ -262,7 +262,7 @@ class BottleShaking(BottleSkill):
         n : int, default=10
             Number of demonstrations.
         seed : int, default=0
-            Of the random numbers: equal seeds give equal demonstrations.
+            Seed of the random numbers: equal seeds give equal demonstrations.
 
         Returns
         -------
@@ -405,11 +405,11 @@ def follow_hands(
     starts : Tensor of shape (n, n_joints)
         Where the joints begin [rad].
     wanted : sequence of Frame
-        Of both hands, ``HANDS``, at each of T instants, of shape (T, n).
+        Poses of both hands, ``HANDS``, at each of T instants, of shape (T, n).
     dt : float
         Between two of them [s].
     posture : Tensor of shape (n_joints,) or (n, n_joints)
-        Which the null space seeks [rad].
+        Posture that the null space seeks [rad].
 
     Returns
     -------

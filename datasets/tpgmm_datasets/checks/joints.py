@@ -176,7 +176,7 @@ def _check_plateaus(
         message = f"motions stop dead at one value and go on from it: {listed(places)}"
         remedy = "Was the recording cut off at a limit, or a sensor saturated?"
         about = sorted(set().union(*odd.values()))
-        joints = dict.fromkeys(next(zip(*odd, strict=True)))
+        joints = dict.fromkeys(name for name, _ in odd)
         yield Finding("clipped", message, remedy, tuple(joints), tuple(about))
 
 

@@ -55,7 +55,7 @@ class RecordingSummary(EpisodeSummary):
     leaps : mapping of str to (float, float, float)
         The largest step of each frame [m], the 98 % quantile of its steps, and when [s].
     digest : str
-        Of the joints: equal for copies.
+        Digest of the joints, equal for copies.
     """
 
     gap: tuple[float, float]

@@ -85,7 +85,7 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
     Parameters
     ----------
     layout : Layout
-        Of the data set.
+        Metadata of the data set.
     joints : str, optional
         Its name; ``"measured"`` or ``"commanded"`` for the usual one of states or of actions.
         The default is the first that there is of both.

@@ -58,7 +58,7 @@ class FramePose:
     feature : str
         Name of the feature.
     columns : sequence of int or str, or slice, optional
-        Which of its values: the position's three, then the rotation's, by place or by name.
+        Values of the feature: the position's three, then the rotation's, by place or by name.
         By default those that are called ``<frame>.x``, ...; all where none are so called.
     rotation : {"wxyz", "xyzw", "rotvec", "euler", "yaw", None}, default="wxyz"
         How the orientation is written: a quaternion, w first or last; a rotation vector;

@@ -40,7 +40,7 @@ def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[s
     calibration : str, Path or mapping of str to these
         A file, or files by prefix of the motors' names.
     names : tuple of str
-        Of the recorded values, ``shoulder_pan.pos`` for the motor ``shoulder_pan``.
+        Names of the recorded values, ``shoulder_pan.pos`` for the motor ``shoulder_pan``.
 
     Returns
     -------

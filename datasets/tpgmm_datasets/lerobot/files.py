@@ -53,7 +53,7 @@ def write_tables(
     path : Path
         The file; its folder is made.
     tables : iterable of pyarrow.Table
-        Of one schema.
+        Rows of one schema.
     metadata : dict of bytes to bytes, optional
         Kept in the file.
     """

@@ -336,7 +336,7 @@ def episode_file(
     template : str
         ``"data_path"`` or ``"video_path"``.
     index : int
-        Of the episode.
+        Index of the episode.
     place : (int, int) or None
         Numbers of chunk and file in v3.0; None in v2.1, where an episode has its own file.
     **texts : str

@@ -73,7 +73,7 @@ def stated_range(root: Path, key: str, width: int) -> Array | None:
     Parameters
     ----------
     root : Path
-        Of the data set, in either layout.
+        Folder of the data set, in either layout.
     key : str
         Name of the column.
     width : int
