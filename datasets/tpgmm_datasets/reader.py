@@ -270,7 +270,7 @@ def _select_indices(by_index: Mapping[int, Episode], wanted: Sequence[int]) -> l
     return [by_index[index] for index in wanted]
 
 
-def opened_by[**P, T](
+def accept_arguments_of[**P, T](
     opener: Callable[P, Recording],
 ) -> Callable[[Callable[[Recording], T]], Callable[P, T]]:
     """Let a function of a recording take the arguments of what opens one.
@@ -278,7 +278,7 @@ def opened_by[**P, T](
     Parameters
     ----------
     opener : callable
-        Whose signature the function then has, for people, editors and type checkers.
+        Function whose signature the decorated one then has, for editors and type checkers.
     """
 
     def decorate(function: Callable[[Recording], T]) -> Callable[P, T]:
@@ -294,7 +294,7 @@ def opened_by[**P, T](
     return decorate
 
 
-@opened_by(open_recording)
+@accept_arguments_of(open_recording)
 def load_lerobot(recording: Recording) -> list[Demonstration]:
     """Read a LeRobot data set as demonstrations; videos are not looked at.
 
@@ -387,7 +387,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     return list(recording.demonstrations())
 
 
-@opened_by(open_recording)
+@accept_arguments_of(open_recording)
 def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
     """Read episode by episode, for sets larger than memory.
 

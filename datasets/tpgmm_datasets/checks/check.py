@@ -11,7 +11,7 @@ import torch
 
 from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
 from tpgmm_datasets.checks.outliers import outliers
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
@@ -134,14 +134,14 @@ def _check_time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         if one.gap[0] > max(GAP_STEPS * one.step, GAP, GAP_SHARE * one.duration)
     ]
     remedy = "Leave the episode out, or cut it"
-    yield from found_at("gaps", "nothing was recorded for", remedy, gaps)
+    yield from report_at("gaps", "nothing was recorded for", remedy, gaps)
     durations = np.array([max(episode.duration, 1e-9) for episode in episodes])
     odd = outliers(np.log(durations), floor=np.log(SAME_DURATION))
     places = [(f"{durations[i]:.4g} s in demonstration {i}", i, "") for i in odd]
     message = f"demonstrations last about {np.median(durations):.4g} s, but"
     remedy = "Is it the same skill, whole, and at the same rate?"
     most = float(durations[odd[0]]) if odd else np.nan
-    yield from found_at("durations", message, remedy, places, most)
+    yield from report_at("durations", message, remedy, places, most)
 
 
 def _list_events(episodes: Sequence[RecordingSummary]) -> list[str]:
@@ -194,7 +194,7 @@ def _check_copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         if i != first.setdefault(one.digest, i) and np.ptp(one.path) > 0
     ]
     remedy = "Leave the copies out: they make the model more certain than it may be"
-    yield from found_at("copies", "some were recorded once and counted twice:", remedy, copies)
+    yield from report_at("copies", "some were recorded once and counted twice:", remedy, copies)
 
 
 def _check_paths(
@@ -216,7 +216,7 @@ def _check_paths(
     ]
     message = "paths go along the median path if they run backwards:"
     remedy = "Are they stored in reverse, or another skill? Leave them out"
-    yield from found_at("episodes", message, remedy, places)
+    yield from report_at("episodes", message, remedy, places)
     if len(episodes) >= FEWEST_PATHS:
         yield from _check_distances(paths - median, episodes[0].joint_names, reverse)
 
@@ -238,7 +238,7 @@ def _check_distances(
     usual = f"in ranges of the joints, by about {typical:.2g}"
     message = f"paths differ from the median path, {usual}, but"
     remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
-    yield from found_at("episodes", message, remedy, places)
+    yield from report_at("episodes", message, remedy, places)
 
 
 def _cosines(steps: Array, usual: Array) -> Array:

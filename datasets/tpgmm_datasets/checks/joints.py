@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
 from tpgmm_torch.checks.report import Finding, listed
@@ -159,7 +159,7 @@ def _check_steps(
             for j, at, size in getattr(episode, check)
             if j in angles
         ]
-        yield from found_at(check, f"there are steps {what}:", remedy, places)
+        yield from report_at(check, f"there are steps {what}:", remedy, places)
 
 
 def _check_plateaus(
@@ -196,4 +196,4 @@ def _check_stuck(
         for share, (e, j) in zip(shares, np.argwhere(stuck).tolist(), strict=True)
     ]
     remedy = "Was a sensor or a motor off? Leave the episode out"
-    yield from found_at("stuck", "joints keep one value while others move:", remedy, places)
+    yield from report_at("stuck", "joints keep one value while others move:", remedy, places)

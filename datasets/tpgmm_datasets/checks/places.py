@@ -5,10 +5,10 @@ from math import nan
 
 from tpgmm_torch.checks.report import Finding, listed
 
-__all__ = ["found_at"]
+__all__ = ["report_at"]
 
 
-def found_at(
+def report_at(
     check: str,
     message: str,
     remedy: str,

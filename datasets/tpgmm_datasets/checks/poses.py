@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.checks.outliers import set_apart
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding
@@ -70,7 +70,7 @@ def _check_places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[F
         ]
         message = f"frame {name!r} is usually within {within:.2g} m of ({centre}), but"
         remedy = "Was the object tracked, and in the same base frame? Leave the episode out"
-        yield from found_at("frames", message, remedy, places)
+        yield from report_at("frames", message, remedy, places)
 
 
 def _check_reach(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
@@ -119,7 +119,7 @@ def _check_angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[F
         usual = f"usually within {np.delete(degrees, odd).max():.0f} deg"
         message = f"frame {name!r} is {usual}, but turned unlike in the others"
         remedy = "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out"
-        yield from found_at("frames", message, remedy, places)
+        yield from report_at("frames", message, remedy, places)
 
 
 def _check_jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
@@ -130,7 +130,7 @@ def _check_jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Fi
         if size > max(JUMP, JUMP_STEPS * usual, JUMP_SPEED * step)
     ]
     remedy = "Did the tracker lose it? Leave the episode out, or give one pose for all of it"
-    yield from found_at("frames", f"frame {name!r} jumps", remedy, places)
+    yield from report_at("frames", f"frame {name!r} jumps", remedy, places)
 
 
 def _check_quaternion_order(
