@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import numpy as np
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT, KNOWN, SEEN
-from tpgmm_datasets.lerobot.episodes import read_episodes
+from tpgmm_datasets.lerobot.episodes import EpisodeRows, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
-from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, open_layout
+from tpgmm_datasets.lerobot.layout import BOOKKEEPING, CAMERAS, Feature, Layout, open_layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.units import guess_unit, with_pose_units
 from tpgmm_torch.data.pose_names import is_gripper
@@ -31,7 +31,7 @@ class ColumnInfo(Feature):
     key, dtype : str
         Name and type.
     shape : tuple of int
-        Of a row's value.
+        Shape of a row's value.
     names : tuple of str or None
         One per value, where the metadata give them so that they can be used.
     units : tuple of str or None
@@ -68,7 +68,7 @@ class DatasetInfo:
     joints : str or None
         The column that ``load_lerobot`` takes for the joints.
     frames, events : tuple of str
-        Those that it finds by itself.
+        Frames and events that ``load_lerobot`` finds by itself.
     tasks : tuple of str
         All tasks.
     lengths : tuple of int
@@ -133,54 +133,71 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
     """
     layout = open_layout(local_folder(path))
     problems = list(layout.problems)
-    features = [
-        feature
-        for key, feature in layout.features.items()
-        if key not in BOOKKEEPING and not feature.is_camera and feature.dtype != "string"
-    ]
-    ranges: dict[str, tuple[Any, Any]] = {}
-    counts: dict[str, Any] = {SEEN: 0, KNOWN: 0}
-    for rows in read_episodes(layout, layout.episodes, features, problems.append):
-        for key, values in rows.values.items():
-            low, high = values.min(axis=0), values.max(axis=0)
-            if key in ranges:
-                low, high = np.minimum(low, ranges[key][0]), np.maximum(high, ranges[key][1])
-            ranges[key] = low, high
-            if key in counts:
-                counts[key] = counts[key] + values.sum(axis=0)
-    joints = None
-    try:
-        joints = joint_feature(layout)
-        names_of(layout.feature(joints), None, None)
-    except DatasetError as problem:
-        problems.append(problem)
-    environment, rows_in_all = (
-        layout.features.get(ENVIRONMENT),
-        sum(episode.length for episode in layout.episodes),
-    )
-    shares = [np.ravel(count) / max(rows_in_all, 1) for count in counts.values()]
-    objects = layout.features[SEEN].names if SEEN in ranges and KNOWN in ranges else ()
+    features = _list_numeric(layout)
+    episodes = read_episodes(layout, layout.episodes, features, problems.append)
+    ranges, sums = _summarise_values(episodes)
+    joints = _find_joints(layout, problems)
+    environment = layout.features.get(ENVIRONMENT)
     return DatasetInfo(
         layout.root,
         layout.version,
         layout.robot_type,
         layout.fps,
-        tuple(_column(feature, ranges.get(feature.key), joints) for feature in features),
+        tuple(_describe_column(item, ranges.get(item.key), joints) for item in features),
         tuple(key for key, feature in layout.features.items() if feature.is_camera),
         joints,
         tuple(pose_groups(environment.names)) if environment else (),
         tuple(f.key.removeprefix(EVENT) for f in features if f.key.startswith(EVENT)),
         layout.tasks,
         tuple(episode.length for episode in layout.episodes),
-        {
-            name: (float(a), float(b))
-            for name, a, b in zip(objects or (), *shares, strict=False)
-        },
+        _share_tracked(layout, sums) if {SEEN, KNOWN} <= sums.keys() else {},
         tuple(problems),
     )
 
 
-def _column(
+def _list_numeric(layout: Layout) -> list[Feature]:
+    """List the columns of numbers that are not LeRobot's own."""
+    features = [item for key, item in layout.features.items() if key not in BOOKKEEPING]
+    return [item for item in features if item.dtype not in (*CAMERAS, "string")]
+
+
+def _find_joints(layout: Layout, problems: list[DatasetError]) -> str | None:
+    """Return the column of the joints, and add what is wrong with it to the problems."""
+    joints = None
+    try:
+        joints = joint_feature(layout)
+        names_of(layout.feature(joints), None, None)
+    except DatasetError as problem:
+        problems.append(problem)
+    return joints
+
+
+def _summarise_values(
+    episodes: Iterable[EpisodeRows],
+) -> tuple[dict[str, tuple[Any, Any]], dict[str, Any]]:
+    """Return the range of each value by column, and the sums of those of tracking."""
+    ranges: dict[str, tuple[Any, Any]] = {}
+    sums: dict[str, Any] = {}
+    for rows in episodes:
+        for key, values in rows.values.items():
+            low, high = values.min(axis=0), values.max(axis=0)
+            if key in ranges:
+                low, high = np.minimum(low, ranges[key][0]), np.maximum(high, ranges[key][1])
+            ranges[key] = low, high
+            if key in (SEEN, KNOWN):
+                sums[key] = sums.get(key, 0) + values.sum(axis=0)
+    return ranges, sums
+
+
+def _share_tracked(layout: Layout, sums: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return in which share of all rows each object was seen, and was seen or inferred."""
+    rows = max(sum(episode.length for episode in layout.episodes), 1)
+    shares = [np.ravel(sums[key]) / rows for key in (SEEN, KNOWN)]
+    named = zip(layout.features[SEEN].names or (), *shares, strict=False)
+    return {name: (float(seen), float(known)) for name, seen, known in named}
+
+
+def _describe_column(
     feature: Feature, extremes: tuple[Any, Any] | None, joints: str | None
 ) -> ColumnInfo:
     if extremes is None:
@@ -189,10 +206,10 @@ def _column(
     column = ColumnInfo(**vars(feature), low=low, high=high)
     if feature.units is not None or feature.key != joints:
         return column
-    apart = [is_gripper(name) for name in feature.names or ("",) * len(low)]
     # the joints of a feature have one unit, grippers may have their own
-    alike = [value for value, own in zip(low + high, apart * 2, strict=True) if not own]
-    common = guess_unit(min(alike, default=0.0), max(alike, default=0.0))
+    apart = np.array([is_gripper(name) for name in feature.names or ("",) * len(low)])
+    alike = np.array((low, high))[:, ~apart]
+    common = guess_unit(alike.min(initial=0.0), alike.max(initial=0.0))
     ranges = zip(low, high, apart, strict=True)
-    guesses = [f"{guess_unit(a, b) if own else common}?" for a, b, own in ranges]
+    guesses = [f"{guess_unit(a, b) if gripper else common}?" for a, b, gripper in ranges]
     return replace(column, units=with_pose_units(feature.names, guesses))

@@ -30,7 +30,7 @@ class EpisodeBatches:
     size : int, default=16
         Episodes in a batch: what is in memory at a time is three batches.
     processes : Processes, optional
-        Those that learn together, see
+        Processes that learn together, see
         :func:`tpgmm_torch.mixture.processes.joined_processes`: each has a consecutive
         share of the episodes.
     **options
@@ -66,7 +66,7 @@ class EpisodeBatches:
         self.size, self._recording = size, replace(recording, episodes=episodes)
 
     def __len__(self) -> int:
-        """Number of batches."""
+        """Return the number of batches."""
         return -(-len(self._recording.episodes) // self.size)
 
     def __iter__(self) -> Iterator[list[Demonstration]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "UnknownUnitsError", "summed_up"]
+__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "UnknownUnitsError", "list_problems"]
 
 #: The checks that ``relax`` may name, with what each of them refuses.
 CHECKS = {
@@ -31,7 +31,7 @@ class DatasetError(DataError):
     message : str
         What is wrong and what to do.
     check : str, optional
-        Which of :data:`CHECKS` failed; empty for what cannot be relaxed.
+        Name of the check in :data:`CHECKS` that failed; empty for what cannot be relaxed.
     file : str or Path, optional
         The file it was found in, relative to the data set.
     episode : int, optional
@@ -51,20 +51,24 @@ class DatasetError(DataError):
     ) -> None:
         self.check, self.episode, self.column = check, episode, column
         self.file = None if file is None else str(file)
-        where = [
-            self.file,
-            None if episode is None else f"episode {episode}",
-            None if column is None else f"column {column!r}",
-        ]
-        place = ", ".join(part for part in where if part)
+        place = [] if self.file is None else [self.file]
+        place += [] if episode is None else [f"episode {episode}"]
+        place += [] if column is None else [f"column {column!r}"]
+        if "relax=" not in message:
+            message += self._suggest_relaxing()
+        super().__init__(f"{', '.join(place)}: {message}" if place else message)
+
+    def _suggest_relaxing(self) -> str:
         # without its description there is no set
         whole = self.file is None or self.file.startswith("meta")
-        if check and "relax=" not in message and not (check == "missing" and whole):
-            lost = "the episode is" if episode is not None else "episodes that fail it are"
-            if check == "metadata" and episode is None:
+        if not self.check or (self.check == "missing" and whole):
+            return ""
+        lost = "the episode is"
+        if self.episode is None:
+            lost = "episodes that fail it are"
+            if self.check == "metadata":
                 lost = "it goes unchecked and no episode is"
-            message += f". With relax=[{check!r}] (--relax {check}) {lost} left out"
-        super().__init__(f"{place}: {message}" if place else message)
+        return f". With relax=[{self.check!r}] (--relax {self.check}) {lost} left out"
 
 
 class UnknownUnitsError(DatasetError):
@@ -75,12 +79,13 @@ class DatasetWarning(UserWarning):
     """A relaxed check dropped something; the message says what and why."""
 
 
-def summed_up(problems: Iterable[DatasetError]) -> list[str]:
-    """One line for all problems that differ in nothing but numbers and episodes.
+def list_problems(problems: Iterable[DatasetError]) -> list[str]:
+    """Write one line for all problems that differ in nothing but numbers and episodes.
 
     Parameters
     ----------
     problems : iterable of DatasetError
+        Problems of one or several episodes.
 
     Returns
     -------

@@ -103,7 +103,7 @@ def estimate_motor_map(
         Where the link was, n_postures poses in the robot's base frame: tracked, or known since
         the link was put there.
     names : sequence of str, optional
-        Of the motors as they are recorded, ``shoulder_pan.pos`` for the joint
+        Names of the motors as they are recorded, ``shoulder_pan.pos`` for the joint
         ``shoulder_pan``; the default is the robot's names in its order.
     units : str, Scale, or mapping of name to these, default="rad"
         What makes angles of the values, up to the sign and the zero: "deg", a
@@ -139,52 +139,74 @@ def estimate_motor_map(
     (-1, 20.0)
     """
     names = tuple(robot.joint_names if names is None else names)
-    stored = {joint: name for name, joint in match_names(robot.joint_names, names, "").items()}
-    motors = [stored[joint] for joint in robot.joint_names]
+    matched = match_names(robot.joint_names, names, "")
+    motors = sorted(matched, key=lambda name: robot.joint_names.index(matched[name]))
     table = as_tensor(values, "values").to(robot.lower)
-    n = len(poses.position) if poses.batch_shape else 0
-    if table.shape != (n, len(names)) or not n:
-        got = f"values {tuple(table.shape)}, poses {tuple(poses.batch_shape)}"
-        wanted = f"have the shape (n, {len(names)}), and there are n poses; got {got}"
-        raise DatasetError(f"values of {len(names)} motors at n postures {wanted}")
-    if wrong := [motor for motor in known if motor not in motors]:
+    _check_postures(table, poses, len(names))
+    if wrong := sorted({*known} - {*motors}):
         raise DatasetError(f"known motors {wrong} are not among {motors}")
     given = units if isinstance(units, Mapping) else dict.fromkeys(names, units)
     scales = {motor: as_scale(given.get(motor, "rad"), motor) for motor in motors}
-    angles = torch.stack(
-        [table[:, names.index(m)] * scales[m].factor + scales[m].offset for m in motors], 1
-    )
-    moves = robot.state(angles).jacobians[:, robot.links.index(link)].abs().amax((0, 1)) > 1e-9
-    chosen = [i for i, motor in enumerate(motors) if moves[i] and motor not in known]
+    angles = _scale_values(table, names, scales)
+    chosen = [i for i in _find_moving_joints(robot, link, angles) if motors[i] not in known]
     if not 0 < len(chosen) <= MOST_MOTORS:
         raise DatasetError(
             f"{len(chosen)} motors move the link {link!r}; the map of 1 to {MOST_MOTORS} can "
             "be estimated at once: take one arm, or say which are known, known=[...]"
         )
-    std = position_std, orientation_std if orientations else math.inf
-    problem = _Problem(robot, link, angles, chosen, poses.to(table), *std)
+    turn_std = orientation_std if orientations else math.inf
+    problem = _Problem(robot, link, angles, chosen, poses.to(table), position_std, turn_std)
+    return _map_motors([motors[i] for i in chosen], scales, problem)
+
+
+def _scale_values(values: Tensor, names: Sequence[str], scales: Mapping[str, Scale]) -> Tensor:
+    columns = [
+        values[:, names.index(motor)] * scale.factor + scale.offset
+        for motor, scale in scales.items()
+    ]
+    return torch.stack(columns, 1)
+
+
+def _find_moving_joints(robot: Kinematics, link: str, joints: Tensor) -> list[int]:
+    jacobians = robot.state(joints).jacobians[:, robot.links.index(link)]
+    moving: list[int] = torch.nonzero(jacobians.abs().amax((0, 1)) > 1e-9).flatten().tolist()
+    return moving
+
+
+def _check_postures(table: Tensor, poses: Frame, motors: int) -> None:
+    n = len(poses.position) if poses.batch_shape else 0
+    if table.shape != (n, motors) or not n:
+        got = f"values {tuple(table.shape)}, poses {tuple(poses.batch_shape)}"
+        wanted = f"have the shape (n, {motors}), and there are n poses; got {got}"
+        raise DatasetError(f"values of {motors} motors at n postures {wanted}")
+
+
+def _map_motors(
+    labels: Sequence[str], scales: Mapping[str, Scale], problem: _Problem
+) -> MotorMap:
+    """Solve the problem for the labelled motors; the others keep their scales."""
     signs, offsets, cost = problem.solve()
     best = int(cost.argmin())
     errors = problem.errors(signs[best], offsets[best])
-    labels = [motors[i] for i in chosen]
-    _check(labels, signs, cost, best, errors, problem.rows)
+    _check_evidence(labels, signs, cost, best, errors, problem.rows)
     # a half turn to either side is the same angle
     wrapped = math.pi - torch.remainder(math.pi - offsets[best], math.tau)
     turns, shifts, uncertainty = (
         dict(zip(labels, column.tolist(), strict=True))
         for column in (signs[best].int(), wrapped, errors)
     )
+    units = dict(scales)
     for motor, turn in turns.items():
         factor, offset = scales[motor].factor, scales[motor].offset
-        scales[motor] = Scale(turn * factor, turn * offset + shifts[motor])
+        units[motor] = Scale(turn * factor, turn * offset + shifts[motor])
     left = problem.misfit(signs[best], offsets[best])
-    return MotorMap(scales, turns, shifts, uncertainty, *left)
+    return MotorMap(units, turns, shifts, uncertainty, *left)
 
 
-def _check(
+def _check_evidence(
     labels: Sequence[str], signs: Tensor, cost: Tensor, best: int, errors: Tensor, rows: int
 ) -> None:
-    """Whether the robot explains the poses, and the postures tell each sign and each offset."""
+    """Check that the robot explains the poses, and the postures each sign and offset."""
     misfit = math.sqrt(2 * float(cost[best]) / rows)
     if misfit > MOST_MISFIT:
         raise DatasetError(
@@ -218,11 +240,11 @@ class _Problem:
 
     @property
     def rows(self) -> int:
-        """How many numbers are known."""
+        """Number of known values."""
         return len(self.angles) * (3 if math.isinf(self.orientation_std) else 6)
 
     def solve(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The best offsets for each choice of signs, and half the sum of squares there."""
+        """Find the best offsets for each choice of signs, and half the sum of squares there."""
         m = len(self.chosen)
         choices = self.angles.new_tensor(list(itertools.product((1.0, -1.0), repeat=m)))
         generator = torch.Generator().manual_seed(0)
@@ -236,21 +258,21 @@ class _Problem:
         return choices, *descend(lambda one: self._residual(choices, one), offsets, FINE)
 
     def errors(self, signs: Tensor, offsets: Tensor) -> Tensor:
-        """Standard errors (m,): of the accuracy that was given, or of what is left if more."""
+        """Estimate standard errors (m,): by the given accuracy, or what is left if more."""
         [residual], [jacobian] = self._residual(signs[None], offsets[None])
         excess = residual.square().sum() / max(self.rows - len(self.chosen), 1)
         covariance = torch.linalg.pinv(jacobian.mT @ jacobian, hermitian=True)
         return (covariance.diagonal() * excess.clamp_min(1)).clamp_min(0).sqrt()
 
     def misfit(self, signs: Tensor, offsets: Tensor) -> tuple[float, float]:
-        """Root mean square distances and angles that are left [m, rad]."""
+        """Compute root mean square distances and angles that are left [m, rad]."""
         parts = self._residual(signs[None], offsets[None])[0].reshape(len(self.angles), 2, 3)
         position, turn = parts.square().sum(-1).mean(0).sqrt().tolist()
         known = not math.isinf(self.orientation_std)
         return position * self.position_std, turn * self.orientation_std if known else math.nan
 
     def _residual(self, signs: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals (S, 6 n) in units of their accuracy, and their Jacobian by the offsets."""
+        """Compute residuals (S, 6 n) in units of their accuracy, and their Jacobian."""
         joints = self.angles.expand(len(signs), *self.angles.shape).clone()
         joints[..., self.chosen] *= signs[:, None]
         joints[..., self.chosen] += offsets[:, None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,11 +11,14 @@ from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_grou
 
 __all__ = ["POSE_PARTS", "match_names", "pose_groups", "quaternion_groups", "value_names"]
 
+#: Groups, name and position of a value.
+Leaf = tuple[tuple[str, ...], Any, Any]
+
 
 def value_names(
     names: Any, width: int, key: str = "", distinct: bool = True
 ) -> tuple[tuple[str, ...] | None, str]:
-    """Flatten what ``info.json`` gives as names of a feature's values.
+    """Flatten the names of a feature's values as ``info.json`` gives them.
 
     Parameters
     ----------
@@ -26,7 +28,7 @@ def value_names(
     width : int
         How many values the feature has.
     key : str
-        Of the feature: a list of nothing but its last word names no value.
+        Name of the feature: a list of nothing but its last word names no value.
     distinct : bool, default=True
         Whether each may be there once only.
 
@@ -37,31 +39,21 @@ def value_names(
     str
         Why they cannot be used; empty if they can, or are missing.
     """
-    found = list(_leaves(names)) if names else []
-    if not found or (len(found) == 1 < width and found[0][1] in re.split(r"[./]", key)):
+    leaves = list(_list_leaves(names)) if names else []
+    if not leaves or (len(leaves) == 1 < width and leaves[0][1] in re.split(r"[./]", key)):
         return None, ""
-    if places := [place for *_, place in found if place is not None]:
-        counts = [[*range(first, len(found) + first)] for first in (0, 1)]
-        if {*map(type, places)} != {int} or sorted(places) not in counts:
-            return None, f"the positions of the names, {places}, do not count the values"
-        found.sort(key=lambda leaf: leaf[2])
-    bare = [name for _, name, _ in found]
-    if wrong := [name for name in bare if not isinstance(name, str) or not name.strip()]:
-        return None, f"{wrong[0]!r} is no name, of {bare}"
-    if len(found) != width:
-        return None, f"{len(found)} names for {width} values, {bare}"
-    if not distinct:
-        return tuple(bare), ""
-    shared = {name for name, count in Counter(bare).items() if count > 1}
-    flat = ["_".join((*g, name)) if name in shared else name for g, name, _ in found]
-    if twice := [name for name, whole in zip(bare, flat, strict=True) if flat.count(whole) > 1]:
-        return None, f"{twice[0]!r} is there twice, of {bare}"
-    return tuple(flat), ""
+    try:
+        leaves = _sort_by_position(leaves)
+        bare = [name for _, name, _ in leaves]
+        _check_names(bare, width)
+        return tuple(_prefix_shared(leaves) if distinct else bare), ""
+    except ValueError as problem:
+        return None, str(problem)
 
 
-def _leaves(names: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    """Groups, name and position (None where none is given) of each name, to any depth."""
-    rest: list[tuple[tuple[str, ...], Any, Any]] = [((), names, None)]
+def _list_leaves(names: Any) -> Iterator[Leaf]:
+    """Yield groups, name and position (None where none is given), to any depth."""
+    rest: list[Leaf] = [((), names, None)]
     while rest:
         groups, name, place = rest.pop()
         if isinstance(name, list):
@@ -73,6 +65,33 @@ def _leaves(names: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
             ]
         else:
             yield groups, name, place
+
+
+def _sort_by_position(leaves: list[Leaf]) -> list[Leaf]:
+    positions = [position for *_, position in leaves if position is not None]
+    if not positions:
+        return leaves
+    counts = [[*range(first, len(leaves) + first)] for first in (0, 1)]
+    if {*map(type, positions)} != {int} or sorted(positions) not in counts:
+        raise ValueError(f"the positions of the names, {positions}, do not count the values")
+    return sorted(leaves, key=lambda leaf: leaf[2])
+
+
+def _check_names(names: list[Any], width: int) -> None:
+    for name in names:
+        if not isinstance(name, str) or not name.strip():
+            raise ValueError(f"{name!r} is no name, of {names}")
+    if len(names) != width:
+        raise ValueError(f"{len(names)} names for {width} values, {names}")
+
+
+def _prefix_shared(leaves: list[Leaf]) -> list[str]:
+    """Put the group's name before names that several groups have."""
+    bare = [name for _, name, _ in leaves]
+    flat = ["_".join((*g, n)) if bare.count(n) > 1 else n for g, n, _ in leaves]
+    if twice := [i for i, name in enumerate(flat) if flat.count(name) > 1]:
+        raise ValueError(f"{bare[twice[0]]!r} is there twice, of {bare}")
+    return flat
 
 
 #: What can be said where names do not match, and where there are none that can be used.

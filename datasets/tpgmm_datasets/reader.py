@@ -24,15 +24,15 @@ from tpgmm_datasets.conversion.joints import (
     joint_feature,
     names_of,
 )
-from tpgmm_datasets.errors import DatasetError, summed_up
+from tpgmm_datasets.errors import DatasetError, list_problems
 from tpgmm_datasets.events import doubtful_events
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
-from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
+from tpgmm_datasets.lerobot.stored_signals import event_features
 from tpgmm_datasets.units import Scale, Unit, Units, fits
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
@@ -55,7 +55,7 @@ class Recording:
     Parameters
     ----------
     episodes : tuple of Episode
-        Which are wanted, in order.
+        Episodes that are wanted, in order.
     assembly : Assembly
         What a demonstration is made of.
     relax : collection of str
@@ -101,9 +101,9 @@ class Recording:
                     summaries.append(RecordingSummary.of(demonstration))
                 yield demonstration
             if lost:
-                policy(DatasetError("; ".join(summed_up(lost)), check="events"))
+                policy(DatasetError("; ".join(list_problems(lost)), check="events"))
             if self.episodes and not read:
-                lost_to = f"{sorted(self.relax)}: {'; '.join(summed_up(policy.problems))}"
+                lost_to = f"{sorted(self.relax)}: {'; '.join(list_problems(policy.problems))}"
                 count = f"none of the {len(self.episodes)} episodes is left"
                 raise DatasetError(f"{count} by the checks that are relaxed, {lost_to}")
             if check:
@@ -122,15 +122,15 @@ class Recording:
         summaries = [RecordingSummary.of(one) for one in self.demonstrations(check=False)]
         return self._report(summaries)
 
-    def unlimited(self) -> Recording:
-        """The same for a robot that knows no limits of "raw" joints."""
+    def drop_raw_limits(self) -> Recording:
+        """Return the same for a robot that knows no limits of "raw" joints."""
         robot, raw = self.assembly.robot, self.assembly.joints.raw
         if not raw or not isinstance(robot, Robot):
             return self
         return replace(self, assembly=replace(self.assembly, robot=robot.unlimited(raw)))
 
     def _report(self, summaries: Sequence[RecordingSummary]) -> Report:
-        """Findings and doubtful events."""
+        """Report findings and doubtful events."""
         robot, raw = self.assembly.robot, self.assembly.joints.raw
         known = robot if isinstance(robot, Kinematics) else None
         report = check_summaries(summaries, known, raw)
@@ -179,15 +179,10 @@ def open_recording(
     feature = layout.feature(joint_feature(layout, joints))
     if calibration is not None:
         names = feature.names or names_of(feature, joint_names, robot)
-        units = _calibrated(feature, calibration, names, units)
+        units = _calibrate_units(feature, calibration, names, units)
     columns = JointColumns.choose(feature, joint_names, units, robot)
-    pairs = zip(feature.names or (), columns.units, strict=False)
-    unknown = [name for name, unit in pairs if unit == "auto"]
-    if calibration is not None and unknown:
-        given = f"units={{{unknown[0]!r}: 'deg', ...}} (--units {unknown[0]}=deg)"
-        remedy = f"give their units, {given}; 'raw' for what is no joint"
-        message = f"the calibration has no motor for {unknown}: {remedy}"
-        raise DatasetError(message, column=feature.key)
+    if calibration is not None:
+        _check_calibrated(columns)
     chosen = tuple(select_episodes(layout, episodes))
     sources = frame_sources(layout, frames, chosen)
     stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
@@ -196,18 +191,38 @@ def open_recording(
     # one unit for all episodes: a quiet one does not decide
     if (stated := stated_range(layout.root, feature.key, feature.width)) is not None:
         assembly.joints.values(stated, file="meta/stats.json")
-    findings = () if joints else tuple(commanded_joints(layout, feature.key))
-    if frames is None and (objects := layout.features.get(ENVIRONMENT)) and objects.misnamed:
+    findings = list[Finding]()
+    if not joints:
+        findings += commanded_joints(layout, feature.key)
+    if frames is None:
+        findings += _find_unnamed_frames(layout)
+    return Recording(chosen, assembly, policy.names, tuple(findings))
+
+
+def _find_unnamed_frames(layout: Layout) -> Iterator[Finding]:
+    """Report frames that are not read, since their values cannot be told apart."""
+    objects = layout.features.get(ENVIRONMENT)
+    if objects and objects.misnamed:
         message = f"no frame is read of {ENVIRONMENT!r}, {objects.misnamed}"
         remedy = "Say where each is, frames={...} (--frame NAME=FEATURE[0:7])"
-        findings += (Finding("frames", message, remedy, (ENVIRONMENT,)),)
-    return Recording(chosen, assembly, policy.names, findings)
+        yield Finding("frames", message, remedy, (ENVIRONMENT,))
 
 
-def _calibrated(
+def _check_calibrated(columns: JointColumns) -> None:
+    """Check that values without a motor have units."""
+    feature = columns.feature
+    pairs = zip(feature.names or (), columns.units, strict=False)
+    if unknown := [name for name, unit in pairs if unit == "auto"]:
+        given = f"units={{{unknown[0]!r}: 'deg', ...}} (--units {unknown[0]}=deg)"
+        remedy = f"give their units, {given}; 'raw' for what is no joint"
+        message = f"the calibration has no motor for {unknown}: {remedy}"
+        raise DatasetError(message, column=feature.key)
+
+
+def _calibrate_units(
     feature: Feature, calibration: Calibration, names: tuple[str, ...] | None, units: Units
 ) -> Units:
-    """Units by name: those that are given, else those of the calibration."""
+    """Return units by name: those that are given, else those of the calibration."""
     if not isinstance(units, Mapping) and units != "auto":
         both = "is for all values, and so is a calibration: give one of them, or units by name"
         raise DatasetError(f"units={units!r} {both}")
@@ -223,7 +238,7 @@ def _calibrated(
 def select_episodes(
     layout: Layout, episodes: slice | Sequence[int] | str | None
 ) -> list[Episode]:
-    """The episodes that are meant, in order of their index, each once.
+    """Select the episodes that are meant, in order of their index, each once.
 
     Raises
     ------
@@ -243,18 +258,19 @@ def select_episodes(
         chosen = [episode for episode in available if episodes in episode.tasks]
         problem = f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
     else:
-        wanted = sorted({int(index) for index in episodes})
-        missing = [index for index in wanted if index not in by_index]
-        problem = f"there are no episodes {missing}; the set has {sorted(by_index)}"
-        chosen = [] if missing else [by_index[index] for index in wanted]
-        if not wanted:
-            return []
+        return _select_indices(by_index, sorted({int(index) for index in episodes}))
     if not chosen:
         raise DatasetError(problem)
     return chosen
 
 
-def opened_by[**P, T](
+def _select_indices(by_index: Mapping[int, Episode], wanted: Sequence[int]) -> list[Episode]:
+    if missing := [index for index in wanted if index not in by_index]:
+        raise DatasetError(f"there are no episodes {missing}; the set has {sorted(by_index)}")
+    return [by_index[index] for index in wanted]
+
+
+def accept_arguments_of[**P, T](
     opener: Callable[P, Recording],
 ) -> Callable[[Callable[[Recording], T]], Callable[P, T]]:
     """Let a function of a recording take the arguments of what opens one.
@@ -262,7 +278,7 @@ def opened_by[**P, T](
     Parameters
     ----------
     opener : callable
-        Whose signature the function then has, for people, editors and type checkers.
+        Function whose signature the decorated one then has, for editors and type checkers.
     """
 
     def decorate(function: Callable[[Recording], T]) -> Callable[P, T]:
@@ -278,7 +294,7 @@ def opened_by[**P, T](
     return decorate
 
 
-@opened_by(open_recording)
+@accept_arguments_of(open_recording)
 def load_lerobot(recording: Recording) -> list[Demonstration]:
     """Read a LeRobot data set as demonstrations; videos are not looked at.
 
@@ -330,7 +346,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         by its name) and ``stop`` where a frame is at them. What is found without confidence is
         no event, and named in the warning.
     episodes : slice, sequence of int, or str, optional
-        Which: of all in order, by index, or those of a task. The default is all.
+        Episodes to read: a slice of all, by index, or those of a task. The default is all.
     rate : float, optional
         Resample to this many steps per second.
     trim : float, optional
@@ -371,7 +387,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     return list(recording.demonstrations())
 
 
-@opened_by(open_recording)
+@accept_arguments_of(open_recording)
 def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
     """Read episode by episode, for sets larger than memory.
 

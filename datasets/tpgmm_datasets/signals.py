@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources
+from tpgmm_datasets.conversion.joints import JointColumns
 from tpgmm_datasets.conversion.poses import FramePose
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
-from tpgmm_datasets.units import Scale, as_scale, shifted
+from tpgmm_datasets.units import Scale, add_offsets
 
 __all__ = ["CELL", "Signals"]
 
@@ -79,62 +80,91 @@ class Signals:
         options["joint_names"] = joint_names
         recording = open_recording(path, robot=robot, **options)
         assembly = recording.assembly
-        layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
-        called = joint_names if isinstance(joint_names, Mapping) else {}
-        given = None if called or joint_names is None else columns.names
-        state = _renamed(layout.features.get(STATE, source), source, called, given)
-        action = layout.features.get(ACTION)
-        action = action and _renamed(action, source, called, given)
-        environment = layout.features.get(ENVIRONMENT)
-        scales = {
-            name: scale
-            for name, scale in zip(columns.names or (), columns.scales, strict=False)
-            if robot is None or name in robot.joint_names
-        }
-        for feature in (state, action):
-            if feature and feature.key != source.key and feature.names and feature.units:
-                _check_units(feature, scales)
-        places = {
-            name: tuple(pose.select(name, environment))
-            for name, pose in frame_sources(layout, frames, recording.episodes).items()
-            if isinstance(pose, FramePose)
-            and environment
-            and (pose.feature, pose.rotation, pose.scale) == (ENVIRONMENT, "wxyz", 1)
-        }
+        layout, columns = assembly.layout, assembly.joints
+        features = {STATE: columns.feature, **layout.features}
+        scales = _select_scales(columns, columns.scales, robot)
+        names = _name_entries(features, columns, joint_names, scales)
         cell = layout.root / CELL
         if cell.exists():  # which has the offsets, and a policy adds them
-            bare = dict(zip(columns.names or (), columns.units, strict=False))
-            scales = {name: as_scale(bare[name], source.key) for name in scales}
+            bare = add_offsets(columns.units, None, columns.feature.key)
+            scales = _select_scales(columns, bare, robot)
+        sources = frame_sources(layout, frames, recording.episodes)
+        environment = layout.features.get(ENVIRONMENT)
         return cls(
             assembly.rate or layout.fps,
-            state.names,
-            action.names if action else None,
+            names[STATE],
+            names.get(ACTION),
             environment.names if environment else None,
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
-            places,
+            _locate_frames(sources, environment) if environment else {},
             cell if cell.exists() else None,
         )
 
 
-def _renamed(
-    feature: Feature, source: Feature, called: Mapping[str, str], given: tuple[str, ...] | None
-) -> Feature:
-    """As somebody calls its values; what names none has the names of the joints in order."""
-    names, alike = feature.names, feature.width == source.width
+def _select_scales(
+    columns: JointColumns, scales: Sequence[Scale], robot: Any
+) -> dict[str, Scale]:
+    """Select the scales of the robot's joints, of all values without a robot."""
+    names = columns.names or ()
+    joints = names if robot is None else robot.joint_names
+    return {n: scale for n, scale in zip(names, scales, strict=False) if n in joints}
+
+
+def _locate_frames(
+    sources: Mapping[str, Any], environment: Feature
+) -> dict[str, tuple[int, ...]]:
+    """Locate frames that the environment's values hold as position and quaternion."""
+    stored = {name: pose for name, pose in sources.items() if isinstance(pose, FramePose)}
+    form = ENVIRONMENT, "wxyz", 1
+    return {
+        name: tuple(pose.select(name, environment))
+        for name, pose in stored.items()
+        if (pose.feature, pose.rotation, pose.scale) == form
+    }
+
+
+def _name_entries(
+    features: Mapping[str, Feature],
+    columns: JointColumns,
+    joint_names: Any,
+    scales: Mapping[str, Scale],
+) -> dict[str, tuple[str, ...] | None]:
+    """Name the entries of states and actions as ``joint_names`` says, and check their units."""
+    if joint_names is None or (joint_names and isinstance(joint_names, Mapping)):
+        given, called = None, joint_names or {}
+    else:
+        given, called = columns.names, {}
+    names = {}
+    for key in sorted(features.keys() & {STATE, ACTION}, reverse=True):  # states first
+        entries = _find_names(features[key], columns.feature, given)
+        names[key] = entries and tuple(called.get(name, name) for name in entries)
+        if features[key].key != columns.feature.key:
+            _check_units(features[key], names[key], scales)
+    return names
+
+
+def _find_names(
+    feature: Feature, source: Feature, given: tuple[str, ...] | None
+) -> tuple[str, ...] | None:
+    """Find the names of values; those without names are the joints in order."""
+    alike = feature.width == source.width
     if feature.misnamed and not (alike and given):
         message = f"its values cannot be distinguished: {feature.misnamed}. {REMEDY}"
         raise DatasetError(message, column=feature.key)
-    if alike and (names is None or (given and names == source.names)):
-        names = given or source.names
-    return replace(feature, names=names and tuple(called.get(name, name) for name in names))
+    if alike and feature.names in (None, source.names):
+        return given or source.names
+    return feature.names
 
 
-def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
-    """Check that other columns of the joints declare the same units, if any."""
-    names, units = feature.names or (), feature.units or ()
+def _check_units(
+    feature: Feature, names: Sequence[str] | None, scales: Mapping[str, Scale]
+) -> None:
+    """Check that another column of the joints declares the same units, if any."""
+    if not names or not feature.units:
+        return
     matched = match_names(list(scales), names, feature.key, REMEDY)
-    own = shifted(units, feature.offsets, feature.key)
-    for entry, unit, scale in zip(names, units, own, strict=True):
+    declared = add_offsets(feature.units, feature.offsets, feature.key)
+    for entry, unit, scale in zip(names, feature.units, declared, strict=True):
         joint = matched.get(entry)
         if joint and unit != "raw" and scale != scales[joint]:
             message = f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit"

@@ -5,7 +5,8 @@ numbers of each frame (``bottle.x``, ``bottle.y``, ``bottle.z`` [m], ``bottle.qw
 ``bottle.qz``), the wrench of each link (``wrench.tool.fx`` to ``wrench.tool.fz`` [N] and
 ``wrench.tool.tx`` to ``wrench.tool.tz`` [N m]), the time of each event (``event.close`` [s],
 the same in all rows of an episode) and, of trajectories, the upper triangle of the joints'
-covariance (``covariance.elbow.wrist``).
+covariance (``covariance.elbow.wrist``). What a column of a table that others wrote is,
+:mod:`tpgmm_datasets.table_columns` decides.
 """
 
 from __future__ import annotations
@@ -19,18 +20,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from tpgmm_datasets.table_columns import (
+    COVARIANCE,
+    EPISODE,
+    EVENT,
+    JOINTS,
+    WRENCH,
+    check_columns,
+    find_joints,
+    list_motion_columns,
+)
 from tpgmm_torch.atomic import open_whole, replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups
 from tpgmm_torch.data.trajectories import Trajectory
-from tpgmm_torch.exceptions import (
-    DataError,
-    DependencyError,
-    PlausibilityWarning,
-    UnknownNameError,
-)
+from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,39 +50,18 @@ __all__ = [
     "write_table",
 ]
 
-EVENT, COVARIANCE, WRENCH = "event.", "covariance.", "wrench."
 #: What a column of a wrench is, behind its link.
 WRENCH_PARTS = ("fx", "fy", "fz", "tx", "ty", "tz")
-#: The column that may be missing.
-EPISODE = "episode"
-#: Where pandas keeps which columns are joints, among the attributes of a table.
-JOINTS = "joints"
-#: Fewer rows do not show that a column counts them.
-FEWEST_COUNTED = 4
-#: A column that changes per second by these, up to a share, is a clock (ns, us, ms, s).
-CLOCKS, CLOCK_ERROR = (1e9, 1e6, 1e3, 1.0), 0.05
 #: Times from here on are since 1970, in this unit.
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11}
-#: What is so called is no joint.
-COUNTS = re.compile(
-    r"(?i)((.*[._/])?(time_?stamp|stamp|seq|nanosec|nsecs?)|(.*stamp[._/])?secs?|time|clock|step"
-    r"|tick|frame|index|(frame|episode|task|sample)_(index|id|nr))(_(s|ms|us|ns))?"
-)
-#: Columns of poses as ROS calls them.
-ROS_POSE = re.compile(
-    r"(?:(.*?)[./_])??(?:(?:pose|transform)[./_])*"
-    r"(?:(?:position|translation)[./_](?P<x>[xyz])|(?:orientation|rotation)[./_](?P<q>[wxyz]))"
-)
 #: How a text begins that spreadsheets take for a formula.
 FORMULA = re.compile(r"'*[=+@\t\r-]")
-#: How pandas calls a column without a name.
-UNNAMED = re.compile(r"(Unnamed: \d+)?")
 #: Rows times columns beyond which a table is not read.
 MOST_NUMBERS = 2e7
 
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
-    """One row per time step of each demonstration.
+    """Write demonstrations as a table, one row per time step.
 
     Parameters
     ----------
@@ -107,23 +92,23 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
     """
     checked = check_demonstrations(demonstrations)
     parts = [
-        _columns(episode, one, one.frames)
+        _motion_columns(episode, one, one.frames)
         | _wrench_columns(one)
         | {f"{EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
         for episode, one in enumerate(checked)
     ]
-    return _table(parts, checked[0])
+    return _join_parts(parts, checked[0])
 
 
 def trajectories_to_frame(
     trajectories: Sequence[Trajectory], frames: Sequence[Mapping[str, Frame]] | None = None
 ) -> pd.DataFrame:
-    """One row per time step of each trajectory, with the covariance of its joints.
+    """Write trajectories and the covariances of their joints as a table, one row per time step.
 
     Parameters
     ----------
     trajectories : sequence of Trajectory
-        Of one model.
+        Trajectories of one model.
     frames : sequence of mapping of str to Frame, optional
         The frames of the situation of each, constant or one per time step.
 
@@ -149,9 +134,11 @@ def trajectories_to_frame(
     for episode, (one, poses) in enumerate(zip(trajectories, situations, strict=True)):
         rows, columns = np.triu_indices(len(one.joint_names))
         upper = as_array(one.covariance)[:, rows, columns]
-        names = covariance_names(one.joint_names)
-        parts.append(_columns(episode, one, poses) | dict(zip(names, upper.T, strict=True)))
-    return _table(parts, trajectories[0])
+        names = _covariance_names(one.joint_names)
+        parts.append(
+            _motion_columns(episode, one, poses) | dict(zip(names, upper.T, strict=True))
+        )
+    return _join_parts(parts, trajectories[0])
 
 
 def demonstrations_from_frame(
@@ -161,7 +148,7 @@ def demonstrations_from_frame(
     time: str = "time",
     episode: str = EPISODE,
 ) -> list[Demonstration]:
-    """The demonstrations in a table.
+    """Read the demonstrations in a table.
 
     Parameters
     ----------
@@ -197,11 +184,11 @@ def demonstrations_from_frame(
     >>> demonstrations_from_frame(table, time="t")
     [Demonstration(2 steps, 0.10 s, 2 joints, frames=[], events={})]
     """
-    table = _checked(table, joints, time, episode)
+    table = check_columns(table, joints, time, episode)
     whole = episode not in table.columns
     parts = [(0, table)] if whole else [*table.groupby(episode, sort=False)]
     parts = [(label, _in_seconds(part, time)) for label, part in parts]
-    names = list(joints) if joints is not None else _joints(table, parts, time, episode)
+    names = list(joints) if joints is not None else find_joints(table, parts, time, episode)
     called = None if names == [str(i) for i in range(len(names))] else tuple(names)
     made = []
     for label, part in parts:
@@ -210,8 +197,8 @@ def demonstrations_from_frame(
             at, values = map(
                 torch.from_numpy, (numbers(kept, [time])[:, 0], numbers(kept, names))
             )
-            poses, events = _poses(kept, {time, episode, *names}), _events(kept)
-            forces = {n: torch.from_numpy(w) for n, w in _wrenches(kept).items()}
+            poses, events = _read_poses(kept, {time, episode, *names}), _read_events(kept)
+            forces = {n: torch.from_numpy(w) for n, w in _read_wrenches(kept).items()}
             made.append(Demonstration(at, values, poses, called, events, wrenches=forces))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
@@ -224,7 +211,7 @@ def write_table(table: pd.DataFrame, path: str | Path) -> None:
     Parameters
     ----------
     table : pandas.DataFrame
-        Of any of these functions.
+        Table from any of these functions.
     path : str or Path
         Ends in .csv, which has all digits, or .parquet. In a .csv a quote stands before names
         that spreadsheets would take for a formula.
@@ -234,7 +221,7 @@ def write_table(table: pd.DataFrame, path: str | Path) -> None:
     DataError
         If it ends otherwise.
     """
-    path = _known(Path(path))
+    path = _check_suffix(Path(path))
     with replacing(path) as new:
         if path.suffix == ".csv":
             safe = [f"'{n}" if FORMULA.match(str(n)) else n for n in table.columns]
@@ -260,10 +247,10 @@ def read_table(path: str | Path) -> pd.DataFrame:
     DependencyError
         If there is no pandas, or no pyarrow for parquet.
     """
-    path, pandas = _known(Path(path)), _pandas()
+    path, pandas = _check_suffix(Path(path)), _import_pandas()
     try:
         with open_whole(path) as file:
-            return _separated(file) if path.suffix == ".csv" else _parquet(file)
+            return _read_csv(file) if path.suffix == ".csv" else _read_parquet(file)
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
     except ImportError as error:
@@ -276,18 +263,17 @@ def read_table(path: str | Path) -> pd.DataFrame:
         raise DataError(f"{path} is no table: {error}") from error
 
 
-def _separated(file: Any) -> pd.DataFrame:
-    """A .csv, whatever separates its fields."""
+def _read_csv(file: Any) -> pd.DataFrame:
+    """Read a .csv, whatever separates its fields."""
     head, row = (file.readline().decode(errors="replace").strip() for _ in range(2))
     file.seek(0)
-    marks = [mark for mark in ",;\t" if mark in head and mark in row]
-    mark = marks[0] if marks else "," if "," in head else r"\s+"
+    mark = _find_separator(head, row)
     comma = mark != "," and re.search(r"\d,\d", row)
     # by default pandas takes the first column for names of rows where these are longer than the
     # header, and before 3.1, which deprecates the option, it is wrong in the last digit
     options: dict[str, Any] = {"decimal": "," if comma else ".", "index_col": False}
     options |= {"sep": mark, "skipinitialspace": True}
-    pandas = _pandas()
+    pandas = _import_pandas()
     if tuple(map(int, pandas.__version__.split(".")[:2])) < (3, 1):
         options["float_precision"] = "round_trip"
     with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
@@ -295,7 +281,13 @@ def _separated(file: Any) -> pd.DataFrame:
     return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
 
 
-def _parquet(file: Any) -> pd.DataFrame:
+def _find_separator(head: str, row: str) -> str:
+    """Return the mark that is in both lines, else a comma of the header, else blanks."""
+    marks = [mark for mark in ",;\t" if mark in head and mark in row]
+    return marks[0] if marks else "," if "," in head else r"\s+"
+
+
+def _read_parquet(file: Any) -> pd.DataFrame:
     from pyarrow import parquet
 
     whole = parquet.ParquetFile(file)
@@ -306,13 +298,13 @@ def _parquet(file: Any) -> pd.DataFrame:
     return whole.read().to_pandas()
 
 
-def covariance_names(joint_names: Sequence[str]) -> list[str]:
-    """Columns of the upper triangle of the covariance of joints, row by row."""
+def _covariance_names(joint_names: Sequence[str]) -> list[str]:
+    """Name the columns of the upper triangle of the covariance of joints, row by row."""
     pairs = zip(*np.triu_indices(len(joint_names)), strict=True)
     return [f"{COVARIANCE}{joint_names[i]}.{joint_names[j]}" for i, j in pairs]
 
 
-def _pandas() -> Any:
+def _import_pandas() -> Any:
     try:
         import pandas
     except ImportError as error:
@@ -320,17 +312,17 @@ def _pandas() -> Any:
     return pandas
 
 
-def _known(path: Path) -> Path:
+def _check_suffix(path: Path) -> Path:
     if path.suffix not in (".csv", ".parquet"):
         raise DataError(f"a table's file ends in .csv or .parquet, got {str(path)!r}")
     return path
 
 
-def _columns(
+def _motion_columns(
     episode: int, motion: Demonstration | Trajectory, frames: Mapping[str, Frame]
 ) -> dict[str, Array]:
-    """Episode, time, joints and frames."""
-    rows, names = len(motion), _joint_names(motion)
+    """Return the columns of episode, time, joints and frames."""
+    rows, names = len(motion), _name_joints(motion)
     columns = [(EPISODE, np.full(rows, episode)), ("time", as_array(motion.time))]
     columns += zip(names, as_array(motion.joints).T, strict=True)
     for name, frame in frames.items():
@@ -343,115 +335,31 @@ def _columns(
     return dict(columns)
 
 
-def _table(
+def _join_parts(
     parts: Sequence[Mapping[str, Array]], motion: Demonstration | Trajectory
 ) -> pd.DataFrame:
-    pandas = _pandas()
+    pandas = _import_pandas()
     table = pandas.concat([pandas.DataFrame(part) for part in parts], ignore_index=True)
     # parquet keeps it: joints may have names like those of poses
-    table.attrs[JOINTS] = _joint_names(motion)
+    table.attrs[JOINTS] = _name_joints(motion)
     return table
 
 
-def _joint_names(motion: Demonstration | Trajectory) -> list[str]:
+def _name_joints(motion: Demonstration | Trajectory) -> list[str]:
     return list(motion.joint_names or map(str, range(motion.joints.shape[-1])))
 
 
-def _checked(
-    table: pd.DataFrame, joints: Sequence[str] | None, time: str, episode: str
-) -> pd.DataFrame:
-    """The table with texts for names, each there once, and all that are asked for."""
-    if not hasattr(table, "columns"):
-        raise DataError(f"a table is a pandas DataFrame, got {type(table).__name__}")
-    if table.index.name == time:
-        table = table.reset_index()
-    kept = {*(joints or ()), *table.attrs.get(JOINTS, ())}
-    table = table.rename(columns=lambda n: n if n in kept else _plain(str(n).strip()))
-    table = table.dropna(how="all")
-    # the second of one name is NAME.1 of pandas
-    again = [n for n in table.columns if n not in kept and re.fullmatch(r".+\.\d+", n)]
-    twice = {n for n in again if n.rpartition(".")[0] in table.columns}
-    if twice := twice | {*table.columns[table.columns.duplicated()]}:
-        raise DataError(f"the table has columns of one name: {sorted(twice)}")
-    if len(table.columns) == 1 and (found := re.findall(r"[,;\t]|\s+", table.columns[0])):
-        message = f"the table has one column, {table.columns[0]!r}: its fields are separated by"
-        raise DataError(f"{message} {found[0]!r}, pandas.read_csv(..., sep={found[0]!r})")
-    asked = () if episode == EPISODE else (episode,)
-    for name in (time, *asked, *(joints or ())):
-        if name not in table.columns:
-            raise UnknownNameError("column", name, "the table", table.columns)
-    if not len(table):
-        raise DataError("the table has no rows")
-    if episode in table.columns and table[episode].isna().any():
-        raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
-    others = _others(table, {time, episode, *(joints or ())})
-    empty = [name for name in others if table[name].isna().all()]
-    if told := [name for name in empty if not UNNAMED.fullmatch(name)]:
-        _warn(f"columns {told} of the table are empty, and left out")
-    return table.drop(columns=empty)
-
-
-def _joints(
-    table: pd.DataFrame, parts: Sequence[tuple[Any, pd.DataFrame]], time: str, episode: str
-) -> list[str]:
-    """Columns that are joints: those known to be, and those that are nothing else."""
-    columns = _others(table, {time, episode})
-    known = {name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns}
-    known |= set(table.attrs.get(JOINTS, ()))
-    rest = [name for name in columns if name not in known]
-    in_poses = {rest[i] for group in pose_groups(rest).values() for i in group}
-    names = [name for name in columns if name not in in_poses]
-    if not names:
-        other = f"{columns} are poses of frames or something else"
-        raise DataError(f"the table has no joints: {other}. If some are, say so: joints=[...]")
-    taken = [name for name in names if name not in known]
-    for frame, missing in _incomplete_poses(taken).items():
-        raise DataError(
-            f"the table has a part of the pose of {frame!r}, and no columns {list(missing)}: "
-            "add them (1, 0, 0, 0 where it is not known), or say which are joints: joints=[...]"
-        )
-    values = [name for name in taken if table[name].dtype.kind in "iuf"]
-    counters = [name for name in values if COUNTS.fullmatch(name)]
-    steady = {n: _steady(parts, n, time) for n in values if n not in counters}
-    if counters := [*counters, *(n for n, kind in steady.items() if kind == "counter")]:
-        raise DataError(
-            f"columns {counters} count the rows or tell the time, and are no joints: drop them "
-            "(pandas: to_csv(..., index=False)), or say which are: joints=[...]"
-        )
-    if unnamed := [name for name in taken if UNNAMED.fullmatch(name)]:
-        raise DataError(f"columns {unnamed} have no name: name or drop them, or joints=[...]")
-    if even := [name for name, kind in steady.items() if kind]:
-        asked = "are they joints (joints=[...]), or do they count something? Then drop them"
-        _warn(f"columns {even} change by the same in every row: {asked}")
-    return names
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, PlausibilityWarning, stacklevel=4)
-
-
-def _steady(parts: Sequence[tuple[Any, pd.DataFrame]], name: str, time: str) -> str:
-    """Whether a column is a ``"counter"``, a clock too, or changes ``"evenly"`` throughout."""
-    steps = np.concatenate([np.diff(part[name].to_numpy(float)) for _, part in parts])
-    if len(steps) < FEWEST_COUNTED - 1 or not steps[0]:
-        return ""
-    even = np.allclose(steps, steps[0], rtol=1e-6, atol=0)
-    ticks = np.concatenate([np.diff(part[time].to_numpy(float)) for _, part in parts])
-    rates = [rate for rate in CLOCKS if np.allclose(steps, rate * ticks, CLOCK_ERROR, 0)]
-    return "counter" if rates or (even and steps[0] % 1 == 0) else "evenly" * even
-
-
 def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
-    """An episode's time and events in seconds: of dates, those since its first row."""
+    """Convert an episode's time and events to seconds: of dates, those since its first row."""
     first, kind = part[time].iloc[0], part[time].dtype.kind
-    unit = next((u for u, low in SINCE_1970.items() if kind in "iuf" and first >= low), None)
+    unit = _find_epoch_unit(first, kind)
     if kind in "biuf" and unit is None:
         return part
     options = {"unit": unit} if unit else {"format": "ISO8601", "utc": True}
     names = [time, *(name for name in part.columns if name.startswith(EVENT))]
     try:
         dates = part[names]
-        dates = dates if kind == "m" else dates.apply(_pandas().to_datetime, **options)
+        dates = dates if kind == "m" else dates.apply(_import_pandas().to_datetime, **options)
         since = (dates - dates[time].iloc[0]).apply(lambda column: column.dt.total_seconds())
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         found = f"column {time!r} holds neither numbers nor dates, its first value is {first!r}"
@@ -459,25 +367,14 @@ def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
     return part.assign(**since)
 
 
-def _plain(name: str) -> str:
-    """A column's name; those of ROS's poses become this module's."""
-    if match := ROS_POSE.fullmatch(name):
-        return f"{(match[1] or 'pose').strip('/')}.{match['x'] or 'q' + match['q']}"
-    return name
+def _find_epoch_unit(first: Any, kind: str) -> str | None:
+    """Return the unit of times since 1970; None for times that are not, or no numbers."""
+    return next((u for u, low in SINCE_1970.items() if kind in "iuf" and first >= low), None)
 
 
-def _others(table: pd.DataFrame, known: set[str]) -> list[str]:
-    """Columns that are joints or poses."""
-    return [
-        name
-        for name in table.columns
-        if name not in known and not name.startswith((EVENT, COVARIANCE, WRENCH))
-    ]
-
-
-def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
-    """The frames, constant where nothing changes."""
-    columns = _others(part, others)
+def _read_poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
+    """Read the frames, constant where nothing changes."""
+    columns = list_motion_columns(part, others)
     frames: dict[str, Frame] = {}
     for name, group in pose_groups(columns).items():
         pose = numbers(part, [columns[i] for i in group])
@@ -487,7 +384,7 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
 
 
 def _wrench_columns(motion: Demonstration) -> dict[str, Array]:
-    """The values of wrenches, by column."""
+    """Return the values of wrenches, by column."""
     return {
         f"{WRENCH}{link}.{part}": values
         for link, wrench in motion.wrenches.items()
@@ -495,8 +392,8 @@ def _wrench_columns(motion: Demonstration) -> dict[str, Array]:
     }
 
 
-def _wrenches(part: pd.DataFrame) -> dict[str, Array]:
-    """Wrenches (T, 6) by link."""
+def _read_wrenches(part: pd.DataFrame) -> dict[str, Array]:
+    """Read wrenches (T, 6) by link."""
     columns = [name for name in part.columns if name.startswith(WRENCH)]
     links = dict.fromkeys(name.removeprefix(WRENCH).rpartition(".")[0] for name in columns)
     found = {
@@ -508,7 +405,7 @@ def _wrenches(part: pd.DataFrame) -> dict[str, Array]:
     return found
 
 
-def _events(part: pd.DataFrame) -> dict[str, float]:
+def _read_events(part: pd.DataFrame) -> dict[str, float]:
     events = {}
     for name in (name for name in part.columns if name.startswith(EVENT)):
         values = numbers(part, [name])
@@ -519,13 +416,14 @@ def _events(part: pd.DataFrame) -> dict[str, float]:
 
 
 def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
-    """Columns of a table as numbers (rows, columns), none of them missing.
+    """Return columns of a table as numbers (rows, columns), none of them missing.
 
     Parameters
     ----------
     part : pandas.DataFrame
+        The table, or the rows of an episode.
     names : sequence of str
-        Of the columns.
+        The columns, in the order of the result.
 
     Raises
     ------
@@ -547,20 +445,3 @@ def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
             raise DataError(f"column {name!r} lacks a value in row {row}")
         columns.append(values.to_numpy(dtype=np.float64))
     return np.stack(columns, axis=1)
-
-
-def _incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """By pose of which the names have a part, the columns that complete it.
-
-    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, count as a pose.
-    """
-    parts: dict[str, set[str]] = {}
-    for name in names:
-        if match := re.fullmatch(r"(.+[._])(x|y|z|qw|qx|qy|qz)", name, re.DOTALL):
-            parts.setdefault(match[1], set()).add(match[2])
-    return {
-        stem[:-1]: tuple(stem + part for part in POSE_PARTS if part not in there)
-        for stem, there in parts.items()
-        if there != set(POSE_PARTS)
-        and (there >= {"x", "y", "z"} or len(there & set(POSE_PARTS[3:])) > 1)
-    }

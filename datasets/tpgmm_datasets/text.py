@@ -13,12 +13,13 @@ from tpgmm_torch.exceptions import DataError
 
 __all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]
 
+NAME = re.compile(r"[^@\[\]]+")
 #: ``FEATURE``, ``FEATURE[7:14]``, ``LINK@EVENT`` or ``LINK@EVENT+x,y,z``; and a table's file.
 SOURCE = re.compile(r"([^=@\[\]]+)(?:@[^=@\[\]]+|\[(\d+):(\d+)\])?|.+\.(?:csv|parquet)")
 
 
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
-    """The argument ``frames``; None without texts.
+    """Parse the argument ``frames``; None without texts.
 
     Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]``, ``NAME=POSES.csv``,
     ``NAME=LINK@EVENT`` or ``NAME=LINK@EVENT+x,y,z``; anything else is a DataError.
@@ -26,20 +27,25 @@ def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
     frames: dict[str, Any] = {}
     for text in texts:
         name, given, source = (part.strip() for part in text.partition("="))
-        match = SOURCE.fullmatch(source)
-        if not re.fullmatch(r"[^@\[\]]+", name) or name in frames or (given and not match):
+        match = SOURCE.fullmatch(source) if given else None
+        if not NAME.fullmatch(name) or name in frames or bool(given) != bool(match):
             raise DataError(
                 f"frame {text!r} is given twice, or is not NAME, NAME=FEATURE, "
                 "NAME=FEATURE[7:14], NAME=POSES.csv or NAME=LINK@EVENT"
             )
-        frames[name] = source or FramePose(ENVIRONMENT, constant=None)
-        if match and match[2]:
-            frames[name] = FramePose(match[1], slice(int(match[2]), int(match[3])))
+        frames[name] = _parse_source(match)
     return frames or None
 
 
+def _parse_source(match: re.Match[str] | None) -> str | FramePose:
+    if match is None:
+        return FramePose(ENVIRONMENT, constant=None)
+    begin, end = match.group(2, 3)
+    return FramePose(match[1], slice(int(begin), int(end))) if begin else match[0]
+
+
 def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
-    """The argument ``events``; None without texts.
+    """Parse the argument ``events``; None without texts.
 
     Each text is ``NAME=HOW``, as ``parse_event`` takes HOW; anything else is a
     DataError.
@@ -49,7 +55,7 @@ def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
 
 
 def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | list[str] | str | None:
-    """The argument ``joint_names``; None without texts.
+    """Parse the argument ``joint_names``; None without texts.
 
     The texts are ``STORED=JOINT`` for some, or one of ``NAME,NAME,...`` for all or ``robot``;
     anything else is a DataError.
@@ -73,7 +79,7 @@ def _pairs(texts: Sequence[str], kind: str, form: str, example: str) -> dict[str
 
 
 def parse_episodes(text: str | None) -> slice | list[int] | str | None:
-    """``"0:10"`` as a slice, ``"0,3,5"`` as a list, anything else as the name of a task."""
+    """Parse ``"0:10"`` as a slice, ``"0,3,5"`` as a list, else the name of a task."""
     if text is None:
         return None
     if re.fullmatch(r"(-?\d*):(-?\d*)", text):
@@ -85,21 +91,22 @@ def parse_episodes(text: str | None) -> slice | list[int] | str | None:
 
 
 def parse_units(texts: Sequence[str]) -> dict[str, Any]:
-    """The arguments ``units`` and ``calibration``.
+    """Parse the arguments ``units`` and ``calibration``.
 
     The texts are one unit for all, and any number of ``JOINT=UNIT`` or ``PATTERN=UNIT`` for
     some; and ``FILE.json`` or ``PREFIX=FILE.json`` for LeRobot's calibration. Anything else is
     a DataError.
     """
-    pairs = [(name, unit) for name, _, unit in (text.rpartition("=") for text in texts)]
-    calibration = {name: unit for name, unit in pairs if unit.endswith(".json")}
-    named = {name: unit for name, unit in pairs if not unit.endswith(".json")}
-    wrong = [text for text in texts if text.startswith("=") or text.endswith("=")]
-    if wrong or len(calibration) + len(named) < len(pairs):
-        raise DataError(
-            "units are one for all, and JOINT=UNIT or PATTERN=UNIT for some, each once; got "
-            f"{list(texts)}"
-        )
-    one = {*named} == {""}
-    units: Any = named[""] if one else {name or "*": unit for name, unit in named.items()}
-    return {"units": units or "auto", "calibration": calibration or None}
+    named: dict[str, str] = {}
+    calibration: dict[str, str] = {}
+    for text in texts:
+        name, _, unit = text.rpartition("=")
+        kind = calibration if unit.endswith(".json") else named
+        if name in kind or text != text.strip("="):
+            wanted = "one for all, and JOINT=UNIT or PATTERN=UNIT for some, each once"
+            raise DataError(f"units are {wanted}; got {list(texts)}")
+        kind[name] = unit
+    units: Any = named.get("") or "auto"
+    if {*named} - {""}:
+        units = {name or "*": unit for name, unit in named.items()}
+    return {"units": units, "calibration": calibration or None}

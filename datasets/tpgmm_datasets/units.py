@@ -15,20 +15,7 @@ from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.pose_names import is_gripper
 
-__all__ = [
-    "LARGEST_ANGLE",
-    "POSE_UNITS",
-    "Scale",
-    "Unit",
-    "Units",
-    "as_scale",
-    "convert",
-    "fits",
-    "guess_unit",
-    "shifted",
-    "units_of",
-    "with_pose_units",
-]
+__all__ = ["Scale", "Unit", "Units"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +45,7 @@ class Scale:
 
     @classmethod
     def between(cls, stored: tuple[float, float], actual: tuple[float, float]) -> Scale:
-        """The scale that takes the two ``stored`` values to the two ``actual`` ones."""
+        """Map the two ``stored`` values to the two ``actual`` ones."""
         if stored[0] == stored[1]:
             raise DatasetError(f"a stored range needs two different ends, got {stored}")
         factor = (actual[1] - actual[0]) / (stored[1] - stored[0])
@@ -66,11 +53,11 @@ class Scale:
 
     @classmethod
     def ticks(cls, per_turn: int, zero: float = 0.0) -> Scale:
-        """Encoder ticks: ``per_turn`` of them are a turn, ``zero`` is the angle 0."""
+        """Map encoder ticks: ``per_turn`` of them are a turn, ``zero`` is the angle 0."""
         return cls(math.tau / per_turn, -zero * math.tau / per_turn)
 
     @classmethod
-    def calibrated(
+    def from_calibration(
         cls,
         range_min: float,
         range_max: float,
@@ -78,7 +65,7 @@ class Scale:
         zero: float | None = None,
         stored: tuple[float, float] = (-100.0, 100.0),
     ) -> Scale:
-        """Values normalised by a calibration, as LeRobot does with motors.
+        """Map values that a calibration normalised, as LeRobot does with motors.
 
         Parameters
         ----------
@@ -123,7 +110,7 @@ def guess_unit(lowest: float, highest: float) -> str:
 
 
 def with_pose_units(names: Sequence[str] | None, units: Sequence[str]) -> tuple[str, ...]:
-    """``units`` with those of poses where the names tell of a pose."""
+    """Return ``units`` with those of poses where the names tell of a pose."""
     changed = list(units)
     for group in pose_groups(names).values():
         for position, unit in zip(group, POSE_UNITS, strict=True):
@@ -161,20 +148,27 @@ def convert(
     scales = [as_scale(unit, column) for unit in units]
     if "auto" in units:
         _check_angles(values, names, units, column, where)
-    for i, (name, scale) in enumerate(zip(names, scales, strict=True)):
-        low, high = scale.stored or (-math.inf, math.inf)
-        least, most = values[:, i].min(), values[:, i].max()
-        if least < low - ROUNDING or most > high + ROUNDING:
-            message = (
-                f"{name!r} goes from {least:.4g} to {most:.4g}, but is to be normalised to "
-                f"{low:g} ... {high:g}: was it recorded in degrees (use_degrees)? Then "
-                "units='deg' (--units deg), without a calibration"
-            )
-            raise DatasetError(message, column=column, **where)
+    for name, scale, stored in zip(names, scales, values.T, strict=True):
+        _check_stored(name, scale, stored, column, where)
     converted: Array = values.astype(np.float64)
     if any(scale != NAMED["raw"] for scale in scales):
         converted = converted * [s.factor for s in scales] + [s.offset for s in scales]
     return converted
+
+
+def _check_stored(
+    name: str, scale: Scale, values: Array, column: str, where: Mapping[str, Any]
+) -> None:
+    """Refuse values (T,) beyond the range to which they were normalised."""
+    low, high = scale.stored or (-math.inf, math.inf)
+    least, most = values.min(), values.max()
+    if least < low - ROUNDING or most > high + ROUNDING:
+        message = (
+            f"{name!r} goes from {least:.4g} to {most:.4g}, but is to be normalised to "
+            f"{low:g} ... {high:g}: was it recorded in degrees (use_degrees)? Then "
+            "units='deg' (--units deg), without a calibration"
+        )
+        raise DatasetError(message, column=column, **where)
 
 
 def _check_angles(
@@ -184,33 +178,38 @@ def _check_angles(
 
     Grippers are of any unit, and say nothing of the others.
     """
-    low, high = values.min(axis=0), values.max(axis=0)
-    auto = [i for i, unit in enumerate(units) if unit == "auto"]
-    large = [i for i in auto if max(abs(low[i]), abs(high[i])) > LARGEST_ANGLE]
-    others = [
-        f"{name!r} is said to be in {unit!r}"
-        for name, unit in zip(names, units, strict=True)
-        if not is_gripper(name)
-        and ((isinstance(unit, Scale) and unit.factor != 1) or unit == "deg")
-    ]
-    told = [f"{names[i]!r} (from {low[i]:.4g} to {high[i]:.4g}" for i in range(len(names))]
-    unsure = [f"{told[i]}: {guess_unit(low[i], high[i])}?)" for i in large]
-    if others or not all(is_gripper(names[i]) for i in large):
-        unsure += [f"{told[i]}: not either)" for i in auto if i not in large]
+    others, large, small = list[str](), list[str](), list[str]()
+    only_grippers = True
+    for name, unit, low, high in zip(names, units, values.min(0), values.max(0), strict=True):
+        span = f"{name!r} (from {low:.4g} to {high:.4g}"
+        if unit != "auto":
+            others += [f"{name!r} is said to be in {unit!r}"] * _is_angular(unit, name)
+        elif max(abs(low), abs(high)) > LARGEST_ANGLE:
+            large.append(f"{span}: {guess_unit(low, high)}?)")
+            only_grippers &= is_gripper(name)
+        else:
+            small.append(f"{span}: not either)")
+    unsure = large if only_grippers and not others else large + small
     if unsure:
         because = f", because {others[0]} and joints have one unit" if others else ""
         message = (
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
             "units='lerobot' (arms in degrees, grippers 0 to 100), 'deg' or units={'*': 'deg', "
-            "'*gripper': 'raw', name: Scale.calibrated(...), ...} (commands: --units lerobot, "
-            "deg, PATTERN=raw or LeRobot's calibration file; training: --policy.units); 'raw' "
-            "takes them as they are"
+            "'*gripper': 'raw', name: Scale.from_calibration(...), ...} (commands: --units "
+            "lerobot, deg, PATTERN=raw or LeRobot's calibration file; training: "
+            "--policy.units); 'raw' takes them as they are"
         )
         raise UnknownUnitsError(message, column=column, **where)
 
 
+def _is_angular(unit: Unit, name: str) -> bool:
+    """Check if a unit says that the joints of the feature, no grippers, are not in radians."""
+    scaled = unit == "deg" or (isinstance(unit, Scale) and unit.factor != 1)
+    return scaled and not is_gripper(name)
+
+
 def as_scale(unit: Unit, column: str) -> Scale:
-    """The scale that a unit stands for.
+    """Return the scale that a unit stands for.
 
     Parameters
     ----------
@@ -234,12 +233,14 @@ def as_scale(unit: Unit, column: str) -> Scale:
     return NAMED[unit]
 
 
-def shifted(units: Sequence[Unit], offsets: Sequence[float] | None, column: str) -> list[Scale]:
-    """The scales that units stand for, with an offset [rad or m] behind each.
+def add_offsets(
+    units: Sequence[Unit], offsets: Sequence[float] | None, column: str
+) -> list[Scale]:
+    """Return the scales that units stand for, with an offset [rad or m] behind each.
 
     Examples
     --------
-    >>> shifted(["rad"], [0.1], "action")
+    >>> add_offsets(["rad"], [0.1], "action")
     [Scale(factor=1.0, offset=0.1)]
     """
     scales = [as_scale(unit, column) for unit in units]
@@ -248,7 +249,7 @@ def shifted(units: Sequence[Unit], offsets: Sequence[float] | None, column: str)
 
 
 def fits(pattern: str, *names: str) -> bool:
-    """Whether a name, with or without LeRobot's ``.pos``, is or matches a ``pattern``."""
+    """Check if a name, with or without LeRobot's ``.pos``, is or matches a ``pattern``."""
     called = {*names, *(name.removesuffix(".pos") for name in names)}
     return pattern in called or any(fnmatchcase(name, pattern) for name in called)
 
@@ -256,7 +257,7 @@ def fits(pattern: str, *names: str) -> bool:
 def units_of(
     units: Units, stored: Sequence[str], final: Sequence[str], robot: Any, column: str
 ) -> list[Unit]:
-    """The unit of each value, ``"auto"`` where none is given.
+    """Choose the unit of each value, ``"auto"`` where none is given.
 
     Names come before patterns, of which later ones come first, and all of them before ``"*"``.
 
@@ -284,23 +285,26 @@ def units_of(
     ['deg', 'mm', 'raw']
     """
     given = units if isinstance(units, Mapping) else {"*": units}
-    chosen: list[Unit] = ["auto"] * len(final)
     called = list(zip(stored, final, strict=True))
-    unknown = [key for key in given if not any(fits(key, *names) for names in called)]
-    if unknown:
+    fitting = {key: _find_places(key, called) for key in given}
+    if unknown := [key for key, places in fitting.items() if not places]:
         there = f"which fit no value; they are called {list(dict.fromkeys(stored))}"
         raise DatasetError(f"units names {unknown}, {there}", column=column)
+    chosen: list[Unit] = ["auto"] * len(final)
     for key in sorted(given, key=lambda key: 2 if key in {*stored, *final} else key != "*"):
-        for place in (i for i, names in enumerate(called) if fits(key, *names)):
-            chosen[place] = given[key]
-    return [
-        _lerobot(*names, robot) if unit == "lerobot" else unit
-        for names, unit in zip(called, chosen, strict=True)
-    ]
+        for place in fitting[key]:
+            chosen[place] = _resolve_lerobot(given[key], *called[place], robot)
+    return chosen
 
 
-def _lerobot(stored: str, name: str, robot: Any) -> Unit:
-    """The unit in which LeRobot's motors say a value."""
+def _find_places(pattern: str, called: Sequence[tuple[str, str]]) -> list[int]:
+    return [i for i, names in enumerate(called) if fits(pattern, *names)]
+
+
+def _resolve_lerobot(unit: Unit, stored: str, name: str, robot: Any) -> Unit:
+    """Replace ``"lerobot"`` by the unit in which LeRobot's motors give a value."""
+    if unit != "lerobot":
+        return unit
     if not is_gripper(stored) and not is_gripper(name):
         return "deg"
     limits = (getattr(robot, key, ()) for key in ("joint_names", "lower", "upper"))

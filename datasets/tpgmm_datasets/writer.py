@@ -120,7 +120,7 @@ def save_lerobot(
     ['data', 'meta']
     """
     given, demonstrations = demonstrations, check_demonstrations(demonstrations)
-    commanded = _commanded(given, actions)
+    commanded = _check_actions(given, actions)
     path = Path(path)
     tasks = _tasks(task, len(demonstrations))
     if dtype not in ("float32", "float64"):
@@ -144,7 +144,7 @@ def save_lerobot(
             raise DatasetError(f"{path} exists; {remedy}")
         # what another process has appended by now is there, and no third can come between
         old = open_layout(path) if path.exists() else None
-        info = declared if old is None else _extended(old, declared)
+        info = declared if old is None else _extend_info(old, declared)
         _Writer(new, info, old).write(demonstrations, tasks, commanded)
     return path
 
@@ -156,7 +156,7 @@ class Column:
     Parameters
     ----------
     names : sequence of str
-        Of its values.
+        Names of its values.
     values : dict of int to ndarray of shape (T, width)
         By the episode's index; one type for all.
     """
@@ -165,7 +165,7 @@ class Column:
     values: dict[int, np.ndarray[Any, Any]]
 
     @property
-    def declared(self) -> dict[str, Any]:
+    def declaration(self) -> dict[str, Any]:
         """Its entry in ``info.json``."""
         dtype = str(next(iter(self.values.values())).dtype)
         return {"dtype": dtype, "shape": [len(self.names)], "names": list(self.names)}
@@ -217,64 +217,87 @@ def add_frames(
     path, out = local_folder(path), Path(out)
     layout = open_to_copy(path, out)
     sources = frame_sources(layout, frames, layout.episodes)
-    if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
+    if {*map(type, sources.values())} != {MeasuredPoses}:
         raise DatasetError(
             f"a table (NAME=POSES.csv) or frames by episode can be added, got {dict(frames)}; "
             "LINK@EVENT and features are learned from the set as it is"
         )
-    old = layout.features.get(ENVIRONMENT)
-    columns = dict(columns or {})
-    declared = {ENVIRONMENT: with_frames(old, list(sources))}
-    declared |= {key: column.declared for key, column in columns.items()}
+    columns = columns or {}
+    declared = {ENVIRONMENT: with_frames(layout.features.get(ENVIRONMENT), list(sources))}
+    declared |= {key: column.declaration for key, column in columns.items()}
     if there := columns.keys() & layout.features.keys():
         raise DatasetError(f"the set has the columns {sorted(there)} already")
-    features = {**layout.info["features"], **declared}
-    for key, shifts in (offsets or {}).items():
-        info = {**(features[key].get("info") or {}), "offsets": list(shifts)}
-        features[key] = {**features[key], "info": info}
+    features = _declare_offsets({**layout.info["features"], **declared}, offsets or {})
     with replacing(out) as new:
         open_to_copy(path, out)
         hidden = shutil.ignore_patterns(".*")
         shutil.copytree(path, new, ignore=hidden, copy_function=_link_videos)
-        found = dict[int, Statistics]()
-        read = read_episodes(layout, layout.episodes, [old] if old else [], Relaxed(()))
-        for file, episodes in groupby(read, key=lambda rows: rows.episode.file):
-            parts = []
-            for rows in episodes:
-                values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
-                poses = stored_frames(layout, sources, rows)
-                index = rows.episode.index
-                added = frame_columns(values, poses, declared, index)
-                added |= {key: column.values[index] for key, column in columns.items()}
-                parts.append(feature_table(added, declared))
-                found[index] = episode_statistics(added)
-            table = pa.concat_tables(parts)
-            _rewrite(path, new, file, {key: table[key] for key in declared})
-        whole = reduce(merge_statistics, found.values())
-        for listed in (path / "meta" / "episodes").glob("*/*.parquet"):
-            file = listed.relative_to(path)
-            [column] = read_columns(listed, path, ["episode_index"]).columns
-            episodes = column.to_pylist()
-            stats = {}
-            for feature, name in ((key, name) for key in whole for name in whole[key]):
-                key = f"stats/{feature}/{name}"
-                listing = [found[number][feature][name].tolist() for number in episodes]
-                stats[key] = pa.array(listing, _episode_type(key))
-            _rewrite(path, new, file, stats)
-        meta = new / "meta"
+        statistics = _add_columns(new, layout, sources, columns, declared)
+        whole = _add_statistics(new, layout.root, statistics)
+        stats = new / "meta" / "stats.json"
         try:
-            stored = {**json.loads((meta / "stats.json").read_text(encoding="utf-8"))}
+            stored = {**json.loads(stats.read_text(encoding="utf-8"))}
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise DatasetError(f"no statistics: {error}", file="meta/stats.json") from error
-        _write_json(meta / "stats.json", {**stored, **whole})
-        _write_json(meta / "info.json", {**layout.info, "features": features})
+        _write_json(stats, {**stored, **whole})
+        _write_json(new / "meta" / "info.json", {**layout.info, "features": features})
         for name, text in (files or {}).items():
             (new / name).write_text(text, encoding="utf-8")
     return out
 
 
+def _declare_offsets(
+    features: dict[str, Any], offsets: Mapping[str, Sequence[float]]
+) -> dict[str, Any]:
+    for key, shifts in offsets.items():
+        info = {**(features[key].get("info") or {}), "offsets": list(shifts)}
+        features[key] = {**features[key], "info": info}
+    return features
+
+
+def _add_columns(
+    new: Path,
+    layout: Layout,
+    sources: Mapping[str, Any],
+    columns: Mapping[str, Column],
+    declared: Mapping[str, Any],
+) -> dict[int, Statistics]:
+    """Add the declared columns to the data files; return their statistics by episode."""
+    found = dict[int, Statistics]()
+    old = [layout.features[ENVIRONMENT]] if ENVIRONMENT in layout.features else []
+    read = read_episodes(layout, layout.episodes, old, Relaxed(()))
+    for file, episodes in groupby(read, key=lambda rows: rows.episode.file):
+        parts = []
+        for rows in episodes:
+            values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
+            index = rows.episode.index
+            poses = stored_frames(layout, sources, rows)
+            added = frame_columns(values, poses, declared, index)
+            added |= {key: column.values[index] for key, column in columns.items()}
+            parts.append(feature_table(added, declared))
+            found[index] = episode_statistics(added)
+        table = pa.concat_tables(parts)
+        _rewrite(layout.root, new, file, {key: table[key] for key in declared})
+    return found
+
+
+def _add_statistics(new: Path, old: Path, found: Mapping[int, Statistics]) -> Statistics:
+    """Add statistics to the lists of episodes; return those of the whole set."""
+    whole = reduce(merge_statistics, found.values())
+    names = [(feature, name) for feature in whole for name in whole[feature]]
+    for listed in (old / "meta" / "episodes").glob("*/*.parquet"):
+        [column] = read_columns(listed, old, ["episode_index"]).columns
+        stats = {}
+        for feature, name in names:
+            key = f"stats/{feature}/{name}"
+            listing = [found[number][feature][name].tolist() for number in column.to_pylist()]
+            stats[key] = pa.array(listing, _episode_type(key))
+        _rewrite(old, new, listed.relative_to(old), stats)
+    return whole
+
+
 def open_to_copy(path: Path, out: Path) -> Layout:
-    """The layout of a set to which :func:`add_frames` can add.
+    """Open the metadata of a set to which :func:`add_frames` can add.
 
     Raises
     ------
@@ -330,10 +353,10 @@ def _tasks(task: str | Sequence[str], count: int) -> list[str]:
     return tasks
 
 
-def _commanded(
+def _check_actions(
     demonstrations: Sequence[Demonstration], actions: Sequence[Any] | None
 ) -> Sequence[Demonstration | None]:
-    """The references as demonstrations: with the same names, and checked as those are."""
+    """Return references as demonstrations, with the same names and checked as those are."""
     if actions is None:
         return [None] * len(demonstrations)
     if len(actions) != len(demonstrations):
@@ -343,8 +366,8 @@ def _commanded(
     return check_demonstrations([replace(item, joints=action) for item, action in pairs])
 
 
-def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
-    """The ``info.json`` of the old set, if the new episodes fit to it."""
+def _extend_info(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
+    """Return the ``info.json`` of the old set, if the new episodes fit to it."""
     if old.problems:
         raise DatasetError(f"the set cannot grow before it is in order: {old.problems[0]}")
     info = dict(old.info)

@@ -143,7 +143,7 @@ def test_units_may_be_the_calibration_of_the_robot(tmp_path):
     (tmp_path / "arm.json").write_text(json.dumps(motors))
     made = config(**UPPER_BODY, units=str(tmp_path / "arm.json"))
     adopt(made, dataset(20, **environment(POSE)))
-    scale = Scale.calibrated(0, 2048)
+    scale = Scale.from_calibration(0, 2048)
     assert made.units == {name: [scale.factor, scale.offset] for name in NAMES[:3]}
 
 

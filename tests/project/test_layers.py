@@ -60,7 +60,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_datasets": (
         ("errors", "least_squares"),
         ("names",),
-        ("units", "robots"),
+        ("units", "robots", "table_columns"),
         ("checks",),
         ("events", "lerobot", "motors", "situation_files", "tables"),
         ("conversion",),

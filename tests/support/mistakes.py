@@ -260,7 +260,7 @@ def a_set_in_degrees_of_which_one_joint_is_quiet(folder):
 @mistake("units", r"(not radians|undecided).*right_elbow")
 def a_calibrated_set_of_which_one_joint_is_quiet(folder):
     root = multiplied(stored(folder), [100.0, 1.0, 1.0])
-    load_lerobot(root, units={"left_elbow": Scale.calibrated(1000, 3000)})
+    load_lerobot(root, units={"left_elbow": Scale.from_calibration(1000, 3000)})
 
 
 @mistake("units", r"not radians: .*'left_elbow'")

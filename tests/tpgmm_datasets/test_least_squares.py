@@ -19,10 +19,10 @@ def test_all_starts_find_the_minimum_of_a_curved_valley() -> None:
 
 
 def test_a_step_that_does_not_help_is_not_taken() -> None:
-    def misled(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def mislead(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return points, torch.ones(len(points), 1, 1, dtype=torch.float64)  # uphill
 
     start = torch.full((1, 1), 2.0, dtype=torch.float64)
-    points, cost = levenberg_marquardt(misled, start, 5)
+    points, cost = levenberg_marquardt(mislead, start, 5)
     assert points.item() == 2.0
     assert cost.item() == 2.0

@@ -17,7 +17,7 @@ MOTORS = [f"{name}.pos" for name in ARM.joint_names]
 ACCURACY = {"position_std": 0.001, "orientation_std": math.radians(0.5)}
 
 
-def recorded(
+def record(
     seed: int, n: int = 10, noise: float = 1.0, reach: float = 0.8
 ) -> tuple[Tensor, Frame, Tensor, Tensor]:
     """Degrees of motors, poses, and the signs and offsets [rad] that are to be found."""
@@ -46,7 +46,7 @@ def errors(found: Any, offsets: Tensor, names: list[str]) -> Tensor:
 @pytest.mark.parametrize("seed", range(3))
 def test_signs_are_right_and_offsets_as_good_as_they_say(seed: int) -> None:
     # ten recordings of which the gripper was tracked at five instants each
-    degrees, poses, signs, offsets = recorded(seed, n=50)
+    degrees, poses, signs, offsets = record(seed, n=50)
     found = estimate_motor_map(ARM, LINK, degrees, poses, names=MOTORS, units="deg", **ACCURACY)
     arm = MOTORS[:5]
     assert list(found.signs) == arm
@@ -60,7 +60,7 @@ def test_signs_are_right_and_offsets_as_good_as_they_say(seed: int) -> None:
 
 
 def test_scales_with_a_zero_of_their_own_and_known_motors_are_kept() -> None:
-    degrees, poses, signs, offsets = recorded(3, noise=0.0)
+    degrees, poses, signs, offsets = record(3, noise=0.0)
     scale = Scale(math.pi / 180, 0.4)
     right = Scale(signs[4].item() * math.pi / 180, offsets[4].item())
     units = dict.fromkeys(MOTORS, scale) | {"wrist_roll.pos": right}
@@ -76,7 +76,7 @@ def test_scales_with_a_zero_of_their_own_and_known_motors_are_kept() -> None:
 
 
 def test_positions_alone_tell_all_but_the_roll() -> None:
-    degrees, poses, signs, offsets = recorded(1)
+    degrees, poses, signs, offsets = record(1)
     told = {"names": MOTORS, "units": "deg", "orientations": False, "position_std": 0.002}
     with pytest.raises(
         DatasetError, match=r"motor 'wrist_roll.pos' .*known=\['wrist_roll.pos'\]"
@@ -107,14 +107,14 @@ def test_a_motor_that_stood_still_is_pointed_out() -> None:
 
 
 def test_poses_that_are_not_the_robots_are_refused() -> None:
-    degrees, poses, _, _ = recorded(4)
+    degrees, poses, _, _ = record(4)
     elsewhere = Frame(poses.position + torch.tensor([0.3, 0, 0]), poses.orientation)
     with pytest.raises(DatasetError, match=r"times further from the robot .* base frame"):
         estimate_motor_map(ARM, LINK, degrees, elsewhere, names=MOTORS, units="deg", **ACCURACY)
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
-    degrees, poses, _, _ = recorded(5)
+    degrees, poses, _, _ = record(5)
     with pytest.raises(DatasetError, match=r"shape \(n, 6\).*got values \(10, 5\)"):
         estimate_motor_map(ARM, LINK, degrees[:, :5], poses)
     with pytest.raises(DatasetError, match=r"poses \(9,\)"):

@@ -78,14 +78,11 @@ def test_no_name_is_lost_in_groups(data):
             assert value_names(groups, width)[0] is None and value_names(groups, width)[1]
 
 
-def test_names_are_read_to_any_depth():
+def test_names_are_read_to_any_depth_but_that_of_the_whole_feature():
     names = ["a"]
     for _ in range(10_000):
         names = [names]
     assert value_names(names, 1) == (("a",), "")
-
-
-def test_a_name_of_the_whole_feature_names_no_value():
     assert value_names(["state"], 3, "observation.state") == (None, "")
     assert value_names(["state"], 1, "observation.state") == (("state",), "")
     assert value_names(["arm"], 3, "observation.state")[1] == "1 names for 3 values, ['arm']"

@@ -15,7 +15,7 @@ from tpgmm_torch import Demonstration, Frame
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory):
+def recording(tmp_path_factory):
     """Two joints in degrees, two objects."""
     path = tmp_path_factory.mktemp("signals") / "set"
     time, joints = np.arange(5) / 10, np.linspace([10.0, 100.0], [90.0, 120.0], 5)
@@ -30,17 +30,17 @@ class Arm:
     joint_names = ("b", "a")
 
 
-def test_signals_of_a_data_set(stored):
-    told = Signals.of(stored, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
+def test_signals_of_a_data_set(recording):
+    told = Signals.of(recording, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
     assert told.fps == 5 and told.state_names == told.action_names == ("a.pos", "b.pos")
     assert told.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
     assert told.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
     assert told.environment_names[7] == "cup.x"
 
 
-def test_offsets_that_a_cell_adds_are_no_part_of_the_units(stored, tmp_path):
+def test_offsets_that_a_cell_adds_are_no_part_of_the_units(recording, tmp_path):
     tracked = tmp_path / "set"
-    shutil.copytree(stored, tracked)
+    shutil.copytree(recording, tracked)
 
     def shift(info):
         for name in ("observation.state", "action"):
@@ -53,12 +53,12 @@ def test_offsets_that_a_cell_adds_are_no_part_of_the_units(stored, tmp_path):
     assert Signals.of(tracked, Arm(), **choices).units["a"] == (np.pi / 180, 0.0)
 
 
-def test_entries_are_called_as_the_joints_are(stored):
+def test_entries_are_called_as_the_joints_are(recording):
     class Other:
         joint_names = ("wrist", "elbow")
 
     names = {"a.pos": "elbow", "b.pos": "wrist"}
-    told = Signals.of(stored, Other(), units="deg", joint_names=names)
+    told = Signals.of(recording, Other(), units="deg", joint_names=names)
     assert told.state_names == told.action_names == ("elbow", "wrist")
     assert set(told.units) == {"elbow", "wrist"}
 
@@ -80,14 +80,14 @@ def test_names_of_all_joints_are_those_of_actions_too(tmp_path, state, order):
             Signals.of(root, Arm())
 
 
-def test_frames_that_no_policy_could_observe_are_left_out(stored):
+def test_frames_that_no_policy_could_observe_are_left_out(recording):
     frames = {
         "here": FramePose(ENVIRONMENT, slice(3, 10)),
         "turned": FramePose(ENVIRONMENT, slice(0, 7), "xyzw"),
         "hand": LinkPose("hand", "grasp"),
         "table": Frame([0.0, 0.0, 0.0]),
     }
-    told = Signals.of(stored, units="raw", frames=frames)
+    told = Signals.of(recording, units="raw", frames=frames)
     assert told.frames == {"here": tuple(range(3, 10))}
     assert told.units == {} and told.fps == 10
 

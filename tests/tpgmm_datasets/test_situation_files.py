@@ -21,18 +21,14 @@ def test_joints_come_as_list_or_by_name(tmp_path):
     items = [
         {"joints": [0.1, 0.2], "frames": {"cup": POSE}},
         {"joints": {"elbow": 0.2, "shoulder": 0.1}, "time": [0.0, 0.5, 1.0]},
+        {"joints": [0, 0], "frames": {"cup": {"position": [1, 2, 3]}}},
     ]
-    listed, named = read_situations(written(tmp_path / "s.json", items), NAMES)
+    listed, named, straight = read_situations(written(tmp_path / "s.json", items), NAMES)
     assert torch.equal(listed.joints, named.joints)
     assert listed.frames["cup"].orientation.tolist() == POSE["orientation"]
     assert listed.time is None
     assert named.time.tolist() == [0.0, 0.5, 1.0]
-
-
-def test_a_frame_without_orientation_is_not_turned(tmp_path):
-    items = [{"joints": [0, 0], "frames": {"cup": {"position": [1, 2, 3]}}}]
-    [situation] = read_situations(written(tmp_path / "s.json", items), NAMES)
-    assert situation.frames["cup"].orientation.tolist() == [1, 0, 0, 0]
+    assert straight.frames["cup"].orientation.tolist() == [1, 0, 0, 0]
 
 
 def test_frames_that_move_may_have_their_own_clock(tmp_path):
@@ -71,8 +67,5 @@ def test_frames_that_move_may_have_their_own_clock(tmp_path):
 def test_bad_files_are_refused_with_the_reason(tmp_path, items, message):
     with pytest.raises(DataError, match=message):
         read_situations(written(tmp_path / "s.json", items), NAMES)
-
-
-def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(DataError, match=r"there is no file .*nowhere\.json"):
         read_situations(tmp_path / "nowhere.json", NAMES)

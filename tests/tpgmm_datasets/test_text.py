@@ -40,22 +40,11 @@ def test_episodes_units_and_frames_are_read_from_text():
     assert parse_frames([]) is None
 
 
-@pytest.mark.parametrize(
-    "texts", [["a="], ["=b"], ["a=b[1]"], ["a=b@"], ["a@b"], ["a=b", "a=c"]]
-)
-def test_a_frame_that_is_none_is_refused(texts):
-    with pytest.raises(DataError, match="is not NAME, NAME=FEATURE"):
-        parse_frames(texts)
-
-
 def test_joint_names_are_read_from_text():
     assert parse_joint_names([]) is None
     assert parse_joint_names(["main = elbow", "b=c"]) == {"main": "elbow", "b": "c"}
     assert parse_joint_names(["a, b,c"]) == ["a", "b", "c"]
     assert parse_joint_names(["robot"]) == "robot"
-    for texts, told in (["a", "b=c"], "not STORED"), (["=a"], "not"), (["a=b", "a=c"], "twice"):
-        with pytest.raises(DataError, match=told):
-            parse_joint_names(texts)
 
 
 def test_events_are_read_from_text():
@@ -65,25 +54,29 @@ def test_events_are_read_from_text():
     assert found == {"close": close, "still": Stop("l_hand", 2)}
 
 
+FRAME, ONCE = "is not NAME, NAME=FEATURE", "units are one for all"
+
+
 @pytest.mark.parametrize(
-    "texts, told",
+    ("parse", "texts", "told"),
     [
-        (["close"], "not NAME=HOW"),
-        (["=closing:a"], "not NAME=HOW"),
-        (["a=stop:x", "a=stop:y"], "given twice"),
-        (["a=closing"], "cannot be found. There are closing:SIGNALS"),
-        (["a=closing:b,"], "needs their names"),
-        (["a=shutting:b"], "cannot be found"),
-        (["a=stop:x:0"], "counted from 1"),
-        (["a=stop:x:second"], "cannot be found"),
+        *((parse_frames, [text], FRAME) for text in ("a=", "=b", "a=b[1]", "a=b@", "a@b")),
+        (parse_frames, ["a=b", "a=c"], FRAME),
+        (parse_joint_names, ["a", "b=c"], "not STORED"),
+        (parse_joint_names, ["=a"], "not"),
+        (parse_joint_names, ["a=b", "a=c"], "twice"),
+        (parse_events, ["close"], "not NAME=HOW"),
+        (parse_events, ["=closing:a"], "not NAME=HOW"),
+        (parse_events, ["a=stop:x", "a=stop:y"], "given twice"),
+        (parse_events, ["a=closing"], "cannot be found. There are closing:SIGNALS"),
+        (parse_events, ["a=closing:b,"], "needs their names"),
+        (parse_events, ["a=shutting:b"], "cannot be found"),
+        (parse_events, ["a=stop:x:0"], "counted from 1"),
+        (parse_events, ["a=stop:x:second"], "cannot be found"),
+        *((parse_units, texts, ONCE) for texts in (["deg", "rad"], ["a=deg", "a=rad"])),
+        *((parse_units, texts, ONCE) for texts in (["a="], ["=deg"], ["=a=deg"])),
     ],
 )
-def test_an_event_that_is_none_is_refused(texts, told):
+def test_other_texts_are_refused(parse, texts, told):
     with pytest.raises(DataError, match=told):
-        parse_events(texts)
-
-
-@pytest.mark.parametrize("texts", [["deg", "rad"], ["a=deg", "a=rad"], ["a="], ["=deg"]])
-def test_units_are_given_once(texts):
-    with pytest.raises(DataError, match="units are one for all"):
-        parse_units(texts)
+        parse(texts)

@@ -56,7 +56,7 @@ def test_values_that_are_no_joints_of_the_robot_need_no_unit(root):
 def test_scales_take_the_ends_of_a_range_to_each_other():
     scale = Scale.between((-100, 100), (-1.0, 3.0))
     assert [scale.factor * x + scale.offset for x in (-100, 0, 100)] == [-1.0, 1.0, 3.0]
-    calibrated = Scale.calibrated(1024, 3072)
+    calibrated = Scale.from_calibration(1024, 3072)
     ends = [calibrated.factor * x + calibrated.offset for x in (-100, 100)]
     assert ends == pytest.approx([-math.pi / 2, math.pi / 2])
     ticks = Scale.ticks(4096, zero=2048)
@@ -70,7 +70,7 @@ def test_scales_take_the_ends_of_a_range_to_each_other():
 @pytest.mark.parametrize("stored", [(-100.0, 100.0), (0.0, 100.0)])
 def test_calibrated_values_are_angles_from_the_zero(zero, per_turn, stored):
     low, high = 1000, 3000
-    scale = Scale.calibrated(low, high, per_turn=per_turn, zero=zero, stored=stored)
+    scale = Scale.from_calibration(low, high, per_turn=per_turn, zero=zero, stored=stored)
     for share in (0.0, 0.3, 1.0):
         value = stored[0] + share * (stored[1] - stored[0])
         tick = low + share * (high - low) - (2000 if zero is None else zero)

@@ -121,10 +121,7 @@ def test_wrong_arguments_are_refused_and_leave_nothing(tmp_path, change, message
     with pytest.raises(DatasetError, match=message):
         save_lerobot([demonstration()], tmp_path / "set", **arguments)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_folder_is_not_overwritten(tmp_path):
-    with pytest.raises(DatasetError, match="append=True"):
+    with pytest.raises(DatasetError, match="append=True"):  # the folder exists
         save_lerobot([demonstration()], tmp_path, fps=FPS, task="reach")
 
 
@@ -153,7 +150,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
     if append:
         save_lerobot(old, root, fps=FPS, task="reach")
 
-    monkeypatch.setattr(writer_module, stage, interrupted)
+    monkeypatch.setattr(writer_module, stage, interrupt)
     with pytest.raises(KeyboardInterrupt):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
     assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])
@@ -179,8 +176,8 @@ def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
     assert "all equal" in result.stdout
 
 
-def saved(written, root):
-    """In two files, with a video beside them."""
+def save_in_two_files(written, root):
+    """Save a set in two files, with a video beside them."""
     for few in (written[:3], written[3:]):
         save_lerobot(few, root, fps=FPS, task="reach", append=True)
     (root / "videos").mkdir()
@@ -193,7 +190,10 @@ def test_a_set_with_frames_added_is_the_one_that_had_them(tmp_path, kept):
     whole = [demonstration(seed, length=10 + seed) for seed in range(5)]
     few = [replace(one, frames={name: one.frames[name] for name in kept}) for one in whole]
     added = {n: [one.frames[n] for one in whole] for n in ("bottle", "hand") if n not in kept}
-    had, root = saved(whole, tmp_path / "had"), saved(few, tmp_path / "set")
+    had, root = (
+        save_in_two_files(whole, tmp_path / "had"),
+        save_in_two_files(few, tmp_path / "set"),
+    )
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     if not added:
         with pytest.raises(DatasetError, match=r"frames \['hand'\] some are in the set"):
@@ -229,10 +229,12 @@ def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
             add_frames(root, tmp_path / "copy", frames)
     with pytest.raises(DatasetError, match=r"sets of v3\.0, this is v2\.1 .*dataset convert"):
         add_frames(to_v21(root, tmp_path / "old"), tmp_path / "copy", given)
-    for stage in ("episode_statistics", "write_tables", "_write_json"):
+    for stage in ("episode_statistics", "write_tables"):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(writer_module, stage, interrupted)
+            patch.setattr(writer_module, stage, interrupt)
             add_frames(root, tmp_path / "copy", given)
+    with pytest.raises(TypeError):  # the last that is written
+        add_frames(root, tmp_path / "copy", given, files={"meta/cell.json": None})
     assert not (tmp_path / "copy").exists()
     (root / "meta" / "stats.json").write_text("[")
     with pytest.raises(DatasetError, match=r"meta/stats\.json: no statistics"):
@@ -241,5 +243,5 @@ def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
         add_frames(root, tmp_path / "old", given)
 
 
-def interrupted(*_):
+def interrupt(*_):
     raise KeyboardInterrupt

@@ -40,13 +40,13 @@ __all__ = [
     "TASK",
     "BottleShaking",
     "BottleSkill",
-    "attached",
+    "approach_bottle",
     "between",
     "bottle_operators",
     "either",
     "follow_hands",
+    "place_hand",
     "pose_error",
-    "reached",
     "upper_body",
     "upright",
 ]
@@ -73,7 +73,7 @@ PHASES = MappingProxyType(
 
 
 def upper_body(**options: object) -> Robot:
-    """The 17-joint upper body with both hands as links.
+    """Make the 17-joint upper body with both hands as links.
 
     Parameters
     ----------
@@ -116,17 +116,17 @@ class BottleSkill:
     robot: Robot = field(default_factory=upper_body, repr=False)
 
     def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
-        """``n`` upright bottles, anywhere in the box."""
+        """Draw ``n`` upright bottles, anywhere in the box."""
         return upright(rng, self.lowest, self.highest, self.yaw, n)
 
     def start_postures(self, n: int, rng: np.random.Generator) -> Tensor:
-        """``n`` start postures around the neutral one, shape (n, 17) [rad]."""
+        """Draw ``n`` start postures around the neutral one, shape (n, 17) [rad]."""
         spread = rng.uniform(-self.start_spread, self.start_spread, (n, self.robot.n_joints))
         joints = self.neutral_posture() + torch.from_numpy(spread)
         return joints.clamp(self.robot.lower, self.robot.upper)
 
     def usual(self, bottle: Frame) -> bool:
-        """Whether a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
+        """Check if a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
         low, high = map(bottle.position.new_tensor, (self.lowest, self.highest))
         inside = (low - 1e-9 <= bottle.position) & (bottle.position <= high + 1e-9)
         w, x, y, z = bottle.orientation.tolist()
@@ -134,11 +134,12 @@ class BottleSkill:
         return bool(inside.all()) and math.hypot(x, y) < 1e-6 and abs(turn) < self.yaw + 1e-6
 
     def grasp_error(self, joints: Tensor, bottle: Frame) -> tuple[Tensor, Tensor]:
-        """How far the hands are from where they should hold the bottle, the worse of both.
+        """Measure how far hands are from where they should hold a bottle, the worse of both.
 
         Parameters
         ----------
         joints : Tensor of shape (..., 17)
+            Postures [rad].
         bottle : Frame
             Its initial pose.
 
@@ -151,13 +152,14 @@ class BottleSkill:
         """
         state = self.robot.state(joints)
         errors = [
-            pose_error(state.pose(hand), attached(bottle, GRASP_POINT[hand])) for hand in HANDS
+            pose_error(state.pose(hand), place_hand(bottle, GRASP_POINT[hand]))
+            for hand in HANDS
         ]
         position, orientation = (torch.maximum(*kind) for kind in zip(*errors, strict=True))
         return position, orientation
 
     def neutral_posture(self) -> Tensor:
-        """The humanoid's published home posture, elbows out and bent, shape (17,) [rad]."""
+        """Return the humanoid's published home posture, elbows bent, shape (17,) [rad]."""
         joints = torch.zeros(self.robot.n_joints, dtype=torch.float64)
         home = {"shoulder_pitch": (0.5, 0.5), "shoulder_roll": (0.5, -0.5)}
         home |= {"shoulder_yaw": (-0.3, 0.3), "elbow": (-1.57, -1.57)}
@@ -167,7 +169,7 @@ class BottleSkill:
         return joints
 
     def _phase_ends(self, n: int, rng: np.random.Generator) -> Tensor:
-        """When each phase ends, shape (n, n_phases) [s]."""
+        """Draw when each phase ends, shape (n, n_phases) [s]."""
         return torch.from_numpy(self._phase_lengths(n, rng).cumsum(1))
 
     def _phase_lengths(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -178,17 +180,17 @@ class BottleSkill:
         return Phases(self.phases, self.rate, self.stretch)
 
     def _times(self, ends: Tensor) -> Tensor:
-        """The instants until the longest demonstration ends, shape (T,) [s]."""
+        """Return the instants until the longest demonstration ends, shape (T,) [s]."""
         return self._timing.times(max(self._timing.steps(ends)))
 
     def _follow(self, starts: Tensor, wanted: Sequence[Frame]) -> Tensor:
-        """Joints (T, n, 17) of all demonstrations, by inverse kinematics."""
+        """Compute joints (T, n, 17) of all demonstrations, by inverse kinematics."""
         return follow_hands(self.robot, starts, wanted, 1 / self.rate, self.neutral_posture())
 
-    def _recorded(
+    def _record(
         self, times: Tensor, joints: Tensor, ends: Tensor, frames: Mapping[str, Frame]
     ) -> list[Demonstration]:
-        """Demonstrations, each until its last phase ends, of frames (n,) or (T, n)."""
+        """Make demonstrations, each until its last phase ends, of frames (n,) or (T, n)."""
         found = []
         for i, steps in enumerate(self._timing.steps(ends)):
             end = dict(zip(self.phases, ends[i].tolist(), strict=True))
@@ -213,7 +215,7 @@ class BottleShaking(BottleSkill):
     rate : float, default=100.0
         Time steps per second.
     amplitude : float, default=0.25
-        Of the shoulders while shaking [rad]; each demonstration's differs by up to 5 %.
+        Swing of the shoulders while shaking [rad]; each demonstration differs by up to 5 %.
     cycles : float, default=3.0
         Periods of the shaking, in nominally 4.5 s.
     stretch : float, default=0.18
@@ -247,28 +249,20 @@ class BottleShaking(BottleSkill):
     steady_rhythm: bool = False
 
     def situations(self, n: int, seed: int = 0) -> list[Situation]:
-        """New bottle poses and start postures.
-
-        Parameters
-        ----------
-        n : int
-        seed : int, default=0
-
-        Returns
-        -------
-        list of Situation
-        """
+        """Draw ``n`` new bottle poses and start postures."""
         rng = np.random.default_rng(seed)
         bottles, starts = self.bottle_poses(n, rng), self.start_postures(n, rng)
         return [Situation(starts[i], {"bottle": bottles[i]}) for i in range(n)]
 
     def demonstrations(self, n: int = 10, seed: int = 0) -> list[Demonstration]:
-        """Demonstrations with different bottle poses, start postures and timing.
+        """Generate demonstrations with different bottle poses, start postures and timing.
 
         Parameters
         ----------
         n : int, default=10
+            Number of demonstrations.
         seed : int, default=0
+            Seed of the random numbers: equal seeds give equal demonstrations.
 
         Returns
         -------
@@ -284,7 +278,7 @@ class BottleShaking(BottleSkill):
         return self._demonstrations(bottles, chests, starts, ends, amplitudes)
 
     def nominal(self, situations: Sequence[Situation]) -> list[Demonstration]:
-        """The skill in given situations, without its spread in timing, chest and amplitude.
+        """Generate the skill in situations, without spread in timing, chest and amplitude.
 
         Parameters
         ----------
@@ -318,8 +312,8 @@ class BottleShaking(BottleSkill):
         wanted = [
             either(
                 progress["bring"] > 0,
-                attached(carried, GRASP_POINT[hand]),
-                reached(first[hand], hand, bottles, progress),
+                place_hand(carried, GRASP_POINT[hand]),
+                approach_bottle(first[hand], hand, bottles, progress),
             )
             for hand in HANDS
         ]
@@ -328,14 +322,14 @@ class BottleShaking(BottleSkill):
         swing = amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u)
         columns = [self.robot.joint_names.index(name) for name in SHOULDERS]
         joints[..., columns] += swing[..., None]
-        return self._recorded(times, joints, ends, {"bottle": bottles})
+        return self._record(times, joints, ends, {"bottle": bottles})
 
     def _events(self, end: Mapping[str, float]) -> dict[str, float]:
         grasp = (end["close"] + end["hold"]) / 2
         return {"grasp": grasp, "shake": end["pause"], "rest": end["shake"]}
 
     def shoulders(self, trajectory: Trajectory | Demonstration) -> Tensor:
-        """Both shoulder pitches of a motion, shape (T, 2) [rad]."""
+        """Return both shoulder pitches of a motion, shape (T, 2) [rad]."""
         columns = [self.robot.joint_names.index(name) for name in SHOULDERS]
         return trajectory.joints[:, columns]
 
@@ -346,14 +340,16 @@ class BottleShaking(BottleSkill):
         return lengths
 
 
-def reached(start: Frame, hand: str, bottle: Frame, progress: Mapping[str, Tensor]) -> Frame:
-    """Where a hand is from its start to the grasp: beside the bottle, then at it."""
-    pose = between(start, attached(bottle, APPROACH_POINT[hand]), progress["reach"])
-    return between(pose, attached(bottle, GRASP_POINT[hand]), progress["close"])
+def approach_bottle(
+    start: Frame, hand: str, bottle: Frame, progress: Mapping[str, Tensor]
+) -> Frame:
+    """Move a hand from its start to the grasp: beside the bottle, then to it."""
+    pose = between(start, place_hand(bottle, APPROACH_POINT[hand]), progress["reach"])
+    return between(pose, place_hand(bottle, GRASP_POINT[hand]), progress["close"])
 
 
 def either(where: Tensor, one: Frame, other: Frame) -> Frame:
-    """One pose where a condition (...) holds, the other elsewhere."""
+    """Return one pose where a condition (...) holds, the other elsewhere."""
     mask = where[..., None]
     return Frame(
         torch.where(mask, one.position, other.position),
@@ -362,7 +358,7 @@ def either(where: Tensor, one: Frame, other: Frame) -> Frame:
 
 
 def pose_error(pose: Frame, target: Frame) -> tuple[Tensor, Tensor]:
-    """Distance [m] and angle [rad] of poses (...) from their targets."""
+    """Compute distance [m] and angle [rad] of poses (...) from their targets."""
     turn = quaternions.product(pose.orientation, quaternions.conjugate(target.orientation))
     distance = torch.linalg.vector_norm(pose.position - target.position, dim=-1)
     return distance, torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
@@ -375,22 +371,22 @@ def upright(
     yaw: float,
     n: int,
 ) -> Frame:
-    """``n`` poses in a box [m], turned about the vertical by up to ``yaw`` either way [deg]."""
+    """Draw ``n`` poses in a box [m], turned about the vertical by up to ``yaw`` [deg]."""
     position = rng.uniform(lowest, highest, (n, 3))
     half = np.radians(rng.uniform(-yaw, yaw, n)) / 2
     zero = np.zeros(n)
     return Frame(position, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=1))
 
 
-def attached(frame: Frame, point: tuple[float, ...]) -> Frame:
-    """The grasp orientation at a point of a frame."""
+def place_hand(frame: Frame, point: tuple[float, ...]) -> Frame:
+    """Place a hand at a point of a frame, turned for the grasp."""
     turn = torch.tensor(GRASP_TURN, dtype=torch.float64).expand_as(frame.orientation)
     where = torch.tensor(point, dtype=torch.float64)
     return Frame(frame.transform(where), quaternions.product(frame.orientation, turn))
 
 
 def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
-    """The pose on a minimum-jerk way from one to another, where ``progress`` of it is done."""
+    """Interpolate poses on a minimum-jerk way, of which ``progress`` is done."""
     u = minimum_jerk(progress)
     position = a.position + u[..., None] * (b.position - a.position)
     start, end = torch.broadcast_tensors(a.orientation, b.orientation)
@@ -398,13 +394,9 @@ def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
 
 
 def follow_hands(
-    robot: Robot,
-    starts: Tensor,
-    wanted: Sequence[Frame],
-    dt: float,
-    posture: Tensor,
+    robot: Robot, starts: Tensor, wanted: Sequence[Frame], dt: float, posture: Tensor
 ) -> Tensor:
-    """Inverse kinematics of both hands along their ways, of all demonstrations at once.
+    """Follow both hands' ways by inverse kinematics, in all demonstrations at once.
 
     Parameters
     ----------
@@ -413,11 +405,11 @@ def follow_hands(
     starts : Tensor of shape (n, n_joints)
         Where the joints begin [rad].
     wanted : sequence of Frame
-        Of both hands, ``HANDS``, at each of T instants, of shape (T, n).
+        Poses of both hands, ``HANDS``, at each of T instants, of shape (T, n).
     dt : float
         Between two of them [s].
     posture : Tensor of shape (n_joints,) or (n, n_joints)
-        Which the null space seeks [rad].
+        Posture that the null space seeks [rad].
 
     Returns
     -------
@@ -439,7 +431,7 @@ def follow_hands(
 def _step(
     robot: Robot, joints: Tensor, wanted: list[Frame], weights: Tensor, rest: Tensor
 ) -> Tensor:
-    """Damped least-squares step to the wanted hand poses; the null space takes ``rest``."""
+    """Compute the damped least-squares step to hand poses; the null space takes ``rest``."""
     state = robot.state(joints)
     errors, rows = [], []
     for hand, target in zip(HANDS, wanted, strict=True):
@@ -456,7 +448,7 @@ def _step(
 
 
 def bottle_operators(orientation: bool = True) -> list[Operator]:
-    """The two operators of eqs (16), (17): both hands seen from the bottle, and the joints.
+    """Make the two operators of eqs (16), (17): both hands in the bottle's frame, and joints.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ import torch
 
 from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
 from tpgmm_datasets.checks.outliers import outliers
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
@@ -95,31 +95,34 @@ def check_summaries(
     robot: Kinematics | None = None,
     raw: Collection[str] = (),
 ) -> Report:
-    """The report of :func:`tpgmm_datasets.check` on summaries of recordings.
+    """Make the report of :func:`tpgmm_datasets.check` on summaries of recordings.
 
     Parameters
     ----------
     episodes : sequence of RecordingSummary
         With the joints in the robot's order.
     robot : Kinematics, optional
+        Its limits and links tell more.
     raw : collection of str, default=()
+        Joints in a unit of their own.
     """
     units = list(unit_findings(episodes, robot))
     findings = [
         *units,
-        *_time(episodes),
-        *_events(episodes),
+        *_check_time(episodes),
+        *_check_phases(episodes),
+        *_check_order(episodes),
         *joint_findings(episodes, robot, raw),
         *pose_findings(episodes, {name for found in units for name in found.names}, robot),
-        *_copies(episodes),
-        *_paths(episodes, robot),
+        *_check_copies(episodes),
+        *_check_paths(episodes, robot),
     ]
     count = len(episodes)
     return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
 
 
-def _time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    """Steps, gaps and durations unlike the others."""
+def _check_time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Find steps, gaps and durations unlike the others."""
     steps = np.array([episode.step for episode in episodes])
     usual = float(np.median(steps))
     if 0 < usual < QUICKEST_STEP:
@@ -131,49 +134,59 @@ def _time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         if one.gap[0] > max(GAP_STEPS * one.step, GAP, GAP_SHARE * one.duration)
     ]
     remedy = "Leave the episode out, or cut it"
-    yield from found_at("gaps", "nothing was recorded for", remedy, gaps)
+    yield from report_at("gaps", "nothing was recorded for", remedy, gaps)
     durations = np.array([max(episode.duration, 1e-9) for episode in episodes])
     odd = outliers(np.log(durations), floor=np.log(SAME_DURATION))
     places = [(f"{durations[i]:.4g} s in demonstration {i}", i, "") for i in odd]
     message = f"demonstrations last about {np.median(durations):.4g} s, but"
     remedy = "Is it the same skill, whole, and at the same rate?"
     most = float(durations[odd[0]]) if odd else np.nan
-    yield from found_at("durations", message, remedy, places, most)
+    yield from report_at("durations", message, remedy, places, most)
 
 
-def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    """Events at another phase than usual, missing, or in another order."""
-    names = list(dict.fromkeys(name for one in episodes for name in one.events))
+def _list_events(episodes: Sequence[RecordingSummary]) -> list[str]:
+    return list(dict.fromkeys(name for one in episodes for name in one.events))
+
+
+def _check_phases(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Find events that are missing, or at another phase than usual."""
+    names = _list_events(episodes)
     places: list[str] = []
     about: set[int] = set()
     for name in names:
         phases = {i: one.events[name] for i, one in enumerate(episodes) if name in one.events}
-        there, values = list(phases), np.array(list(phases.values()))
-        usual = float(np.median(values))
-        odd = sorted(there[k] for k in outliers(values, floor=SAME_PHASE))
-        at = [f"at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}" for i in odd]
-        lost = [i for i in range(len(episodes)) if i not in phases]
-        if lost and len(lost) < len(there):
-            at, odd = [*at, f"missing in {listed([str(i) for i in lost])}"], [*odd, *lost]
-        places += [f"{name!r} {text}" for text in at]
+        usual = float(np.median(list(phases.values())))
+        odd = [[*phases][k] for k in outliers([*phases.values()], floor=SAME_PHASE)]
+        for i in sorted(odd):
+            places.append(
+                f"{name!r} at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}"
+            )
+        lost = sorted({*range(len(episodes))} - phases.keys())
+        if lost and len(lost) < len(phases):
+            places.append(f"{name!r} missing in {listed([*map(str, lost)])}")
+            odd += lost
         about.update(odd)
     if places:
         message = f"events are not where they usually are: {listed(places)}"
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
-    for first, second in combinations(names, 2):
+
+
+def _check_order(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Find pairs of events that are in another order than usual."""
+    for first, second in combinations(_list_events(episodes), 2):
         pair = {first, second}
         both = {i: e.events for i, e in enumerate(episodes) if pair <= e.events.keys()}
         ahead = [i for i, at in both.items() if at[first] > at[second]]
         order = first, second
         if 2 * len(ahead) > len(both):
-            ahead, order = [i for i in both if i not in ahead], (second, first)
+            ahead, order = sorted(both.keys() - {*ahead}), (second, first)
         if 0 < len(ahead) <= len(both) / 4:
             message = f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
             these = listed([str(i) for i in ahead])
             yield Finding("events", message + these, BY_HAND, order, tuple(ahead))
 
 
-def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     first: dict[str, int] = {}
     copies = [
         (f"demonstration {i} is a copy of {first[one.digest]}", i, "")
@@ -181,14 +194,16 @@ def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         if i != first.setdefault(one.digest, i) and np.ptp(one.path) > 0
     ]
     remedy = "Leave the copies out: they make the model more certain than it may be"
-    yield from found_at("copies", "some were recorded once and counted twice:", remedy, copies)
+    yield from report_at("copies", "some were recorded once and counted twice:", remedy, copies)
 
 
-def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Iterator[Finding]:
-    """Episodes whose path is far from the median path, or runs backwards along it."""
+def _check_paths(
+    episodes: Sequence[RecordingSummary], robot: Kinematics | None
+) -> Iterator[Finding]:
+    """Find episodes whose path is far from the median path, or runs backwards along it."""
     if len(episodes) < FEWEST_REVERSED:
         return
-    paths = _aligned_signs(episodes, robot)
+    paths = _stack_paths(episodes, robot)
     paths /= np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
     median = np.median(paths, axis=0)
     along, turned = (
@@ -201,35 +216,40 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
     ]
     message = "paths go along the median path if they run backwards:"
     remedy = "Are they stored in reverse, or another skill? Leave them out"
-    yield from found_at("episodes", message, remedy, places)
-    if len(episodes) < FEWEST_PATHS:
-        return
-    squares = (paths - median) ** 2
+    yield from report_at("episodes", message, remedy, places)
+    if len(episodes) >= FEWEST_PATHS:
+        yield from _check_distances(paths - median, episodes[0].joint_names, reverse)
+
+
+def _check_distances(
+    differences: Array, joint_names: Sequence[str] | None, known: Collection[int]
+) -> Iterator[Finding]:
+    """Find paths far from the median path, of which the differences (E, P, n_joints) are."""
+    squares = differences**2
     distances = np.sqrt(squares.mean(axis=(1, 2)))
     typical = float(np.median(distances))
-    far = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
-    names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(paths.shape[-1]))
+    names = joint_names or tuple(f"joint {j}" for j in range(squares.shape[-1]))
     most = [names[j] for j in squares.mean(axis=1).argmax(axis=1)]
     places = [
         (f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})", i, most[i])
-        for i in far
-        if i not in reverse
+        for i in outliers(distances, floor=SAME_PATH)
+        if distances[i] > typical and i not in known
     ]
     usual = f"in ranges of the joints, by about {typical:.2g}"
     message = f"paths differ from the median path, {usual}, but"
     remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
-    yield from found_at("episodes", message, remedy, places)
+    yield from report_at("episodes", message, remedy, places)
 
 
 def _cosines(steps: Array, usual: Array) -> Array:
-    """Of the angles between the steps (E, P - 1, n_joints) and usual ones, as vectors."""
+    """Compute cosines between the steps (E, P - 1, n_joints) and usual ones, as vectors."""
     lengths = np.sqrt((steps**2).sum((1, 2)) * (usual**2).sum())
     cosines: Array = (steps * usual).sum((1, 2)) / np.maximum(lengths, 1e-12)
     return cosines
 
 
-def _aligned_signs(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:
-    """Paths (E, P, n_joints), quaternions among them each on the side of their mean."""
+def _stack_paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:
+    """Stack paths (E, P, n_joints), quaternions among them on the side of their mean."""
     paths = np.stack([episode.path for episode in episodes])
     for columns in quaternion_columns(episodes[0].joint_names, robot):
         turns = quaternions.continuous(torch.from_numpy(paths[..., columns]))

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
 from tpgmm_torch.checks.report import Finding, listed
@@ -31,7 +31,7 @@ UNMOVED = 1e-9
 def quaternion_columns(
     names: Sequence[str] | None, robot: Kinematics | None
 ) -> list[list[int]]:
-    """Columns of the quaternions among joints, known by names or by the robot."""
+    """List the columns of the quaternions among joints, known by names or by the robot."""
     starts = robot.quaternion_starts if robot is not None else ()
     groups = {tuple(range(start, start + 4)) for start in starts} | {*quaternion_groups(names)}
     return [list(group) for group in sorted(groups)]
@@ -40,7 +40,7 @@ def quaternion_columns(
 def joint_findings(
     episodes: Sequence[RecordingSummary], robot: Kinematics | None, raw: Collection[str]
 ) -> Iterator[Finding]:
-    """Units where there are no limits, speeds, wraps, jumps, clipped, stuck and still values.
+    """Find other units, speeds, wraps, jumps, clipped, stuck and still values.
 
     Parameters
     ----------
@@ -53,41 +53,64 @@ def joint_findings(
     """
     low = np.min([episode.low for episode in episodes], axis=0)
     high = np.max([episode.high for episode in episodes], axis=0)
-    names = (robot.joint_names if robot is not None else episodes[0].joint_names) or tuple(
-        f"joint {i}" for i in range(len(low))
-    )
-    quaternion = {i for group in quaternion_columns(names, robot) for i in group}
-    angles = [
-        i
-        for i, name in enumerate(names)
-        if i not in quaternion and name not in raw and not is_gripper(name)
-    ]
-    largest = np.maximum(-low, high)
+    named = episodes[0] if robot is None else robot
+    names = named.joint_names or tuple(f"joint {i}" for i in range(len(low)))
+    quaternion = set().union(*quaternion_columns(names, robot))
+    angles = _select_angles(names, raw, quaternion)
+    yield from _check_limits(episodes, names, (low, high), angles, robot)
+    small = np.maximum(-low, high) <= LARGEST_ANGLE
+    yield from _check_steps(episodes, names, [i for i in angles if small[i]])
+    yield from _check_plateaus(episodes, names, angles)
+    yield from _check_stuck(episodes, names)
+    if not isinstance(robot, Poses):  # hands may stay in a plane
+        yield from _check_idle(episodes, names, quaternion)
+
+
+def _select_angles(
+    names: Sequence[str], raw: Collection[str], quaternion: Collection[int]
+) -> list[int]:
+    """Select the joints that are in radians or metres, and no part of a quaternion."""
+    others = {i for i, name in enumerate(names) if name in raw or is_gripper(name)}
+    return sorted({*range(len(names))} - others.union(quaternion))
+
+
+def _check_limits(
+    episodes: Sequence[RecordingSummary],
+    names: Sequence[str],
+    extremes: tuple[Array, Array],
+    angles: Sequence[int],
+    robot: Kinematics | None,
+) -> Iterator[Finding]:
+    """Find other units where no limits are known, and speeds that the robot cannot reach."""
+    low, high = extremes
     limits: Array = np.full((2, len(low)), [[-np.inf], [np.inf]])
     if robot is not None:
         limits = np.stack((as_array(robot.lower), as_array(robot.upper)))
     excess = np.maximum(limits[0] - low, high - limits[1])
     if not np.isfinite(limits).any():
         limit = FAR if isinstance(robot, Poses) else LARGEST_ANGLE
-        yield from _units(names, low, high, angles, limit)
+        yield from _check_units(names, low, high, angles, limit)
     if robot is not None and excess.max(initial=0) <= IMPOSSIBLE:  # else speeds are wrong too
-        yield from _speeds(episodes, names, as_array(robot.velocity))
-    yield from _steps(episodes, names, [i for i in angles if largest[i] <= LARGEST_ANGLE])
-    yield from _clipped(episodes, names, angles)
-    yield from _stuck(episodes, names)
+        yield from _check_speeds(episodes, names, as_array(robot.velocity))
+
+
+def _check_idle(
+    episodes: Sequence[RecordingSummary], names: Sequence[str], quaternion: Collection[int]
+) -> Iterator[Finding]:
+    """Find joints, not parts of poses, that never move."""
     moved = np.max([episode.high - episode.low for episode in episodes], axis=0)
-    posed = {i for group in pose_groups(names).values() for i in group} | quaternion
-    idle = [n for i, n in enumerate(names) if moved[i] <= UNMOVED and i not in posed]
-    if idle and not isinstance(robot, Poses):  # hands may stay in a plane
+    in_poses = {i for group in pose_groups(names).values() for i in group}.union(quaternion)
+    idle = [n for i, n in enumerate(names) if moved[i] <= UNMOVED and i not in in_poses]
+    if idle:
         message = f"joints never move, in any demonstration: {listed(idle)}"
         remedy = "Were they recorded? Leave out those that the skill does not need"
         yield Finding("still", message, remedy, tuple(idle))
 
 
-def _units(
+def _check_units(
     names: Sequence[str], low: Array, high: Array, angles: Sequence[int], limit: float
 ) -> Iterator[Finding]:
-    """Values that are hardly radians, or metres of tracked links, where no limits are known."""
+    """Find values that are hardly radians, or metres of tracked links, without limits."""
     largest = np.maximum(-low, high)
     odd = sorted((i for i in angles if largest[i] > limit), key=lambda i: -largest[i])
     if odd:
@@ -102,7 +125,7 @@ def _units(
         yield Finding("units", message, remedy, tuple(names[i] for i in odd))
 
 
-def _speeds(
+def _check_speeds(
     episodes: Sequence[RecordingSummary], names: Sequence[str], velocity: Array
 ) -> Iterator[Finding]:
     fastest = np.stack([one.fastest for one in episodes])
@@ -120,10 +143,10 @@ def _speeds(
         yield Finding("speed", message, remedy, tuple(names[j] for j in odd), tuple(about))
 
 
-def _steps(
+def _check_steps(
     episodes: Sequence[RecordingSummary], names: Sequence[str], angles: Sequence[int]
 ) -> Iterator[Finding]:
-    """Wraps and jumps."""
+    """Find wraps and jumps."""
     lost = "Were values lost, or the recording stopped? Repair or leave out the episode"
     kinds = {
         "wraps": ("by a whole turn", "Unwrap the joints (np.unwrap(joints, axis=0))"),
@@ -136,30 +159,31 @@ def _steps(
             for j, at, size in getattr(episode, check)
             if j in angles
         ]
-        yield from found_at(check, f"there are steps {what}:", remedy, places)
+        yield from report_at(check, f"there are steps {what}:", remedy, places)
 
 
-def _clipped(
+def _check_plateaus(
     episodes: Sequence[RecordingSummary], names: Sequence[str], angles: Sequence[int]
 ) -> Iterator[Finding]:
-    """The same end of a range, run into and left at full speed more than once."""
+    """Find ends of a range that are run into and left at full speed more than once."""
     ends: dict[tuple[str, float], list[int]] = {}
     for index, episode in enumerate(episodes):
         for joint, value, _ in episode.plateaus:
             if joint in angles:
                 ends.setdefault((names[joint], value), []).append(index)
-    odd = {end: indices for end, indices in ends.items() if len(indices) > 1}
-    if odd:
+    if odd := {end: indices for end, indices in ends.items() if len(indices) > 1}:
         places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
         message = f"motions stop dead at one value and go on from it: {listed(places)}"
         remedy = "Was the recording cut off at a limit, or a sensor saturated?"
-        about = sorted({index for indices in odd.values() for index in indices})
+        about = sorted(set().union(*odd.values()))
         joints = dict.fromkeys(name for name, _ in odd)
         yield Finding("clipped", message, remedy, tuple(joints), tuple(about))
 
 
-def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterator[Finding]:
-    """A joint that keeps one value in one episode and moves in the others."""
+def _check_stuck(
+    episodes: Sequence[RecordingSummary], names: Sequence[str]
+) -> Iterator[Finding]:
+    """Find joints that keep one value in one episode and move in the others."""
     if len(episodes) < 3:
         return
     ranges = np.stack([one.high - one.low for one in episodes])
@@ -172,4 +196,4 @@ def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterat
         for share, (e, j) in zip(shares, np.argwhere(stuck).tolist(), strict=True)
     ]
     remedy = "Was a sensor or a motor off? Leave the episode out"
-    yield from found_at("stuck", "joints keep one value while others move:", remedy, places)
+    yield from report_at("stuck", "joints keep one value while others move:", remedy, places)

@@ -22,7 +22,7 @@ APART, FEWEST_PLACES = 4.0, 5
 
 
 def outliers(values: Sequence[float] | Array, floor: float) -> list[int]:
-    """Indices of the values far from the median, the farthest first.
+    """Find the indices of values far from the median, the farthest first.
 
     A value is far if it is six times 1.4826 median absolute deviations (Hampel's identifier
     [1]_) and more than ``floor`` away.
@@ -53,7 +53,7 @@ def outliers(values: Sequence[float] | Array, floor: float) -> list[int]:
 
 
 def set_apart(distances: Array, floor: float) -> list[int]:
-    """Indices of the few that are far away from where all others are, by a gap.
+    """Find the indices of the few that are far from where all others are, by a gap.
 
     At most a third is set apart: by at least four times the largest distance of the others,
     and more than ``floor``. That a usual scatter, in a box or by a normal law, shows such a

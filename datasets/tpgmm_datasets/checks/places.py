@@ -5,17 +5,17 @@ from math import nan
 
 from tpgmm_torch.checks.report import Finding, listed
 
-__all__ = ["found_at"]
+__all__ = ["report_at"]
 
 
-def found_at(
+def report_at(
     check: str,
     message: str,
     remedy: str,
     places: Sequence[tuple[str, int, str]],
     value: float = nan,
 ) -> Iterator[Finding]:
-    """The finding about some places, if there are any.
+    """Report some places as one finding, if there are any.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.checks.outliers import set_apart
-from tpgmm_datasets.checks.places import found_at
+from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding
@@ -33,28 +33,29 @@ def pose_findings(
     other_units: Collection[str],
     robot: Kinematics | None = None,
 ) -> Iterator[Finding]:
-    """Quaternion order, lost trackers, jumps, places unlike the others or out of reach.
+    """Find other quaternion orders, lost trackers, jumps, and places out of reach or unusual.
 
     Parameters
     ----------
     episodes : sequence of RecordingSummary
+        With the same frames.
     other_units : collection of str
         Frames whose positions are not in metres: these say nothing more.
     robot : Kinematics, optional
         Whose links come near objects.
     """
     if isinstance(robot, Robot) and robot.links and episodes[0].frames and not other_units:
-        yield from _distance(episodes, robot)
+        yield from _check_reach(episodes, robot)
     for name in episodes[0].frames:
         if name not in other_units:
-            yield from _places(name, episodes)
-            yield from _angles(name, episodes)
-            yield from _jumps(name, episodes)
-        yield from _quaternion_order(name, episodes)
+            yield from _check_places(name, episodes)
+            yield from _check_angles(name, episodes)
+            yield from _check_jumps(name, episodes)
+        yield from _check_quaternion_order(name, episodes)
 
 
-def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    """Episodes in which the object is where it never is otherwise."""
+def _check_places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Find episodes in which the object is where it never is otherwise."""
     first = np.stack([episode.frames[name].position for episode in episodes])
     usual = np.median(first, axis=0)
     distances = np.linalg.norm(first - usual, axis=1)
@@ -69,21 +70,12 @@ def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
         ]
         message = f"frame {name!r} is usually within {within:.2g} m of ({centre}), but"
         remedy = "Was the object tracked, and in the same base frame? Leave the episode out"
-        yield from found_at("frames", message, remedy, places)
+        yield from report_at("frames", message, remedy, places)
 
 
-def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
-    """Objects that no hand comes near, and the base in whose frame one would."""
-    paths = np.stack([episode.path for episode in episodes])
-    hands = as_array(robot.state(paths).positions)[:, :, None]
-    places = np.array([[one.position for one in e.frames.values()] for e in episodes])
-    root = robot.config()["base"]
-    fixed = (j for j in robot.model.joints if j.type == "fixed" and j.parent == root)
-    bases = {"": np.eye(4)} | {joint.child: joint.origin for joint in fixed}
-    gaps = {}
-    for base, pose in bases.items():
-        there = (places @ pose[:3, :3].T + pose[:3, 3])[:, None, :, None]
-        gaps[base] = float(np.linalg.norm(hands - there, axis=-1).min())
+def _check_reach(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
+    """Find objects that no hand comes near, and the base in whose frame one would."""
+    gaps = _measure_gaps(episodes, robot)
     best = min(gaps, key=lambda base: gaps[base])
     if gaps[""] <= REACHED:
         return
@@ -100,8 +92,23 @@ def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Fi
     yield Finding("distance", message, remedy, (*episodes[0].frames,), value=gaps[""])
 
 
-def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    """Episodes in which the object is turned as it never is otherwise."""
+def _measure_gaps(episodes: Sequence[RecordingSummary], robot: Robot) -> dict[str, float]:
+    """Measure how near hands come to objects [m], were poses in the frame of each base."""
+    paths = np.stack([episode.path for episode in episodes])
+    hands = as_array(robot.state(paths).positions)[:, :, None]
+    places = np.array([[one.position for one in e.frames.values()] for e in episodes])
+    root = robot.config()["base"]
+    fixed = (j for j in robot.model.joints if j.type == "fixed" and j.parent == root)
+    bases = {"": np.eye(4)} | {joint.child: joint.origin for joint in fixed}
+    gaps = {}
+    for base, pose in bases.items():
+        there = (places @ pose[:3, :3].T + pose[:3, 3])[:, None, :, None]
+        gaps[base] = float(np.linalg.norm(hands - there, axis=-1).min())
+    return gaps
+
+
+def _check_angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Find episodes in which the object is turned as it never is otherwise."""
     turns = np.stack([episode.frames[name].orientation for episode in episodes])
     some = turns[:MOST_COMPARED]
     angles = 2 * np.arccos(np.abs(turns @ some.T).clip(max=1))
@@ -112,10 +119,10 @@ def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
         usual = f"usually within {np.delete(degrees, odd).max():.0f} deg"
         message = f"frame {name!r} is {usual}, but turned unlike in the others"
         remedy = "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out"
-        yield from found_at("frames", message, remedy, places)
+        yield from report_at("frames", message, remedy, places)
 
 
-def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     leaps = [(*episode.leaps[name], episode.step) for episode in episodes]
     places = [
         (f"by {size:.3g} m at {at:.4g} s of demonstration {i}", i, name)
@@ -123,11 +130,13 @@ def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]
         if size > max(JUMP, JUMP_STEPS * usual, JUMP_SPEED * step)
     ]
     remedy = "Did the tracker lose it? Leave the episode out, or give one pose for all of it"
-    yield from found_at("frames", f"frame {name!r} jumps", remedy, places)
+    yield from report_at("frames", f"frame {name!r} jumps", remedy, places)
 
 
-def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
-    """Half-turns that would be turns about the vertical, were w the last number."""
+def _check_quaternion_order(
+    name: str, episodes: Sequence[RecordingSummary]
+) -> Iterator[Finding]:
+    """Find half-turns that would be turns about the vertical, were w the last number."""
     given = np.concatenate([episode.turns[name] for episode in episodes])
     upright, spread = _upright(given)
     meant, _ = _upright(np.roll(given, 1, axis=-1))
@@ -145,7 +154,7 @@ def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterat
 
 
 def _upright(orientations: Array) -> tuple[float, float]:
-    """Share of the scatter of orientations about the vertical axis, and its size [rad]."""
+    """Return the share of scatter about the vertical axis, and the scatter [rad]."""
     given = torch.from_numpy(orientations)
     back = quaternions.conjugate(quaternions.mean(given))
     squares = as_array(quaternions.log(quaternions.product(given, back))) ** 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -55,7 +55,7 @@ class RecordingSummary(EpisodeSummary):
     leaps : mapping of str to (float, float, float)
         The largest step of each frame [m], the 98 % quantile of its steps, and when [s].
     digest : str
-        Of the joints: equal for copies.
+        Digest of the joints, equal for copies.
     """
 
     gap: tuple[float, float]
@@ -80,7 +80,7 @@ class RecordingSummary(EpisodeSummary):
         longest = int(periods.argmax()) if len(periods) else 0
         phases = np.linspace(0, len(time) - 1, PHASES).round().astype(int)
         poses = demonstration.frames
-        wraps, jumps = _jumps(time, joints, steps)
+        wraps, jumps = _find_jumps(time, joints, steps)
         return cls(
             **vars(EpisodeSummary.of(demonstration)),
             gap=(float(periods.max(initial=0)), float(time[longest])),
@@ -89,20 +89,20 @@ class RecordingSummary(EpisodeSummary):
             fastest=speeds.max(axis=0),
             wraps=wraps,
             jumps=jumps,
-            plateaus=_plateaus(joints, steps),
-            still=_still(steps),
+            plateaus=_find_plateaus(joints, steps),
+            still=_measure_still(steps),
             turns={
                 name: as_array(
                     frame.orientation[phases] if frame.batch_shape else frame.orientation[None]
                 )
                 for name, frame in poses.items()
             },
-            leaps={name: _leap(frame, time) for name, frame in poses.items()},
+            leaps={name: _find_leap(frame, time) for name, frame in poses.items()},
             digest=hashlib.sha256(joints.tobytes()).hexdigest(),
         )
 
 
-def _leap(frame: Frame, time: Array) -> tuple[float, float, float]:
+def _find_leap(frame: Frame, time: Array) -> tuple[float, float, float]:
     if not frame.batch_shape or len(time) < 2:
         return 0.0, 0.0, 0.0
     steps = np.linalg.norm(np.diff(as_array(frame.position), axis=0), axis=1)
@@ -110,10 +110,10 @@ def _leap(frame: Frame, time: Array) -> tuple[float, float, float]:
     return float(steps[at]), float(np.quantile(steps, 0.98)), float(time[at + 1])
 
 
-def _jumps(
+def _find_jumps(
     time: Array, joints: Array, steps: Array
 ) -> tuple[tuple[JointEvent, ...], tuple[JointEvent, ...]]:
-    """Steps by a whole turn, and steps that are like no other of their joint."""
+    """Find steps by a whole turn, and steps that are like no other of their joint."""
     if len(steps) < 3:
         return (), ()
     sizes = np.abs(steps)
@@ -121,7 +121,7 @@ def _jumps(
     least = np.stack(
         (JUMP * np.quantile(sizes, 0.98, axis=0), JUMP_SHARE * np.ptp(joints, axis=0))
     )
-    large = (sizes > least.max(axis=0, initial=SMALLEST_JUMP)) & ~turn & ~_switched(joints)
+    large = (sizes > least.max(axis=0, initial=SMALLEST_JUMP)) & ~turn & ~_is_switched(joints)
 
     def found(mask: NDArray[np.bool_]) -> Iterable[JointEvent]:
         return ((int(j), float(time[t + 1]), float(sizes[t, j])) for t, j in np.argwhere(mask))
@@ -129,17 +129,17 @@ def _jumps(
     return tuple(found(turn)), tuple(found(large))
 
 
-def _switched(joints: Array) -> NDArray[np.bool_]:
+def _is_switched(joints: Array) -> NDArray[np.bool_]:
     return np.array([len(np.unique(column)) <= FEW_VALUES for column in joints.T])
 
 
 def _runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Beginnings and ends (exclusive) of the runs of True, shape (n, 2)."""
+    """Find beginnings and ends (exclusive) of the runs of True, shape (n, 2)."""
     return np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])))).reshape(-1, 2)
 
 
-def _still(steps: Array) -> Array:
-    """Share of the longest run in which one joint keeps its value and most others do not."""
+def _measure_still(steps: Array) -> Array:
+    """Measure the longest run, its share, in which a joint rests and most others do not."""
     shares = np.zeros(steps.shape[1])
     moving = steps != 0
     for joint in range(steps.shape[1]):
@@ -152,23 +152,28 @@ def _still(steps: Array) -> Array:
     return shares
 
 
-def _plateaus(joints: Array, steps: Array) -> tuple[JointEvent, ...]:
-    """Where a path runs into an end of its range at full speed, stays, and leaves it so.
+def _find_plateaus(joints: Array, steps: Array) -> tuple[JointEvent, ...]:
+    """Find where a path runs into an end of its range at full speed, stays, and leaves it so.
 
     A motion that comes to rest slows down before; one that is cut off does not.
     """
-    found = []
-    for joint, (column, size) in enumerate(zip(joints.T, np.abs(steps).T, strict=True)):
-        swing = float(np.ptp(column))
-        if swing < 0.02 or len(np.unique(column)) <= FEW_VALUES:
-            continue
+    found: list[JointEvent] = []
+    sizes, moving = np.abs(steps), (np.ptp(joints, axis=0) >= 0.02) & ~_is_switched(joints)
+    for joint in np.flatnonzero(moving).tolist():
+        column, size = joints[:, joint], sizes[:, joint]
         least = 0.5 * np.quantile(size, 0.75)
         for end in (column.min(), column.max()):
-            for begin, stop in _runs(column == end):
-                # the steps onto the plateau and from it are cut off too: look one further
-                inside = begin > 1 and stop < len(column) - 1
-                if not inside or stop - begin < SHORTEST_PLATEAU or not least:
-                    continue
-                if min(size[begin - 2], size[stop]) > least:
-                    found.append((joint, float(end), swing))
+            plateau = joint, float(end), float(np.ptp(column))
+            runs = _runs(column == end).tolist()
+            found += [plateau for run in runs if _is_cut_off(run, size, least)]
     return tuple(found)
+
+
+def _is_cut_off(run: Sequence[int], size: Array, least: float) -> bool:
+    """Check if steps before and after a run of one value are larger than ``least`` > 0."""
+    begin, stop = run
+    # the steps onto the plateau and from it are cut off too: look one further
+    inside = begin > 1 and stop < len(size)
+    if not inside or stop - begin < SHORTEST_PLATEAU or not least:
+        return False
+    return bool(min(size[begin - 2], size[stop]) > least)

@@ -16,9 +16,13 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.events import Detector, parse_event, usual_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
-from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout
-from tpgmm_datasets.lerobot.wrenches import stored_wrenches, wrench_features
+from tpgmm_datasets.lerobot.stored_signals import (
+    event_features,
+    flagged_events,
+    stored_wrenches,
+    wrench_features,
+)
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -26,10 +30,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import holding_as_in
 
-__all__ = [
-    "Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources",
-    "stored_frames",
-]  # fmt: skip
+__all__ = ["Assembly", "EventSource", "FrameSource"]
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]
@@ -39,7 +40,7 @@ EventSource = str | Detector | Callable[[Demonstration], float]
 def frame_sources(
     layout: Layout, frames: Mapping[str, FrameSource] | None, chosen: Sequence[Episode]
 ) -> dict[str, Pose]:
-    """Where each frame is in the chosen episodes; None stands for those that the set names.
+    """Find where each frame is in the chosen episodes; None stands for those the set names.
 
     Raises
     ------
@@ -66,7 +67,7 @@ def _frame_source(
             return MeasuredPoses.read(name, path, wanted, known)
         return LinkPose.parse(text) if "@" in text else FramePose(text)
     given = isinstance(source, Pose)
-    return source if given else MeasuredPoses.given(name, source, wanted, known)
+    return source if given else MeasuredPoses.take(name, source, wanted, known)
 
 
 def event_sources(
@@ -75,18 +76,18 @@ def event_sources(
     stored: Collection[str],
     names: Sequence[str] | None,
 ) -> dict[str, Detector | Callable[[Demonstration], float]]:
-    """How each event is found: as given, and where a frame is at one, by the event's name.
+    """Choose how each event is found: as given, and where a frame is at one, by its name.
 
     Parameters
     ----------
     events : mapping of str to str, Detector or callable, or None
-        Those that are given.
+        Events that are given.
     frames : mapping of str to FramePose, LinkPose, MeasuredPoses or Frame
-        Which may be at others.
+        Sources of the frames, some perhaps at other events.
     stored : collection of str
         Events that are there already.
     names : sequence of str or None
-        Of all signals.
+        Names of all signals, a gripper's among them.
 
     Raises
     ------
@@ -102,28 +103,30 @@ def event_sources(
     }
     usual: dict[str, Detector] = {}
     for name, pose in frames.items():
-        if not isinstance(pose, LinkPose) or not isinstance(pose.event, str):
+        if not isinstance(pose, LinkPose) or pose.event in (*sources, *stored):
             continue
-        where, event = f"frame {name!r}", pose.event
-        if event in sources or event in stored:
-            continue
-        try:
-            detector = usual_event(event, pose.link, names or ())
-        except DataError as error:
-            message = f"{where}: event {event!r} is not in the data set, and {error}"
-            raise DatasetError(message) from error
+        event, detector = str(pose.event), _find_usual_event(name, pose, names or ())
         if detector is not None and usual.setdefault(event, detector) != detector:
-            raise DatasetError(
-                f"{where}: {event!r} of {pose.link!r} is another event than of the other "
-                f"links; call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
-            )
+            another = f"{event!r} of {pose.link!r} is another event than of the other links"
+            remedy = f"call it otherwise: events={{'{event}_{pose.link}': 'closing:SIGNAL'}}"
+            raise DatasetError(f"frame {name!r}: {another}; {remedy}")
     return sources | usual
+
+
+def _find_usual_event(frame: str, pose: LinkPose, names: Sequence[str]) -> Detector | None:
+    if not isinstance(pose.event, str):
+        return None
+    try:
+        return usual_event(pose.event, pose.link, names)
+    except DataError as error:
+        message = f"frame {frame!r}: event {pose.event!r} is not in the data set, and {error}"
+        raise DatasetError(message) from error
 
 
 def stored_frames(
     layout: Layout, sources: Mapping[str, Pose], rows: EpisodeRows
 ) -> dict[str, Frame]:
-    """The frames of an episode that are not at links."""
+    """Read the frames of an episode that are not at links."""
     frames, where = dict[str, Frame](), rows.episode.where
     for name, source in sources.items():
         if isinstance(source, FramePose):
@@ -187,24 +190,24 @@ class Assembly:
         """Features that have to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        joints = [one.feature for one in (self.joints, self.measured) if one]
+        joints = [one.feature for one in (self.joints, self.measured_joints) if one]
         return [*joints, *objects, *event_features(self.layout), *wrench_features(self.layout)]
 
     @property
-    def measured(self) -> JointColumns | None:
+    def measured_joints(self) -> JointColumns | None:
         """The measured joints, where ``joints`` are the same as they are commanded.
 
         In them it is found what the robot holds.
         """
-        stored, own = self.layout.features, self.joints.feature
-        state = next((stored[key] for key in MEASURED if key in stored), own)
-        alike = state != own and (state.names, state.width) == (own.names, own.width)
-        known = own.key in COMMANDED and isinstance(self.robot, Kinematics)
+        stored, read = self.layout.features, self.joints.feature
+        state = next((stored[key] for key in MEASURED if key in stored), read)
+        alike = state != read and (state.names, state.width) == (read.names, read.width)
+        known = read.key in COMMANDED and isinstance(self.robot, Kinematics)
         return replace(self.joints, feature=state) if alike and known else None
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
-        where, measured = rows.episode.where, self.measured
+        where, measured = rows.episode.where, self.measured_joints
         joints = self.joints.values(rows.values[self.joints.feature.key], **where)
         demonstration = Demonstration(
             torch.from_numpy(rows.time),

@@ -14,7 +14,7 @@ from tpgmm_datasets.errors import DatasetError, DatasetWarning
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, Layout
 from tpgmm_datasets.names import NAME_ALL, match_names
-from tpgmm_datasets.units import Scale, Unit, Units, as_scale, convert, shifted, units_of
+from tpgmm_datasets.units import Scale, Unit, Units, add_offsets, as_scale, convert, units_of
 from tpgmm_torch.checks.report import Finding
 
 __all__ = ["JointColumns", "commanded_joints", "joint_feature", "names_of"]
@@ -59,12 +59,12 @@ class JointColumns:
             If a name or unit does not fit.
         """
         final = names_of(feature, names, robot)
-        return cls(feature, final, _units(feature, final, units, robot))
+        return cls(feature, final, _choose_units(feature, final, units, robot))
 
     @property
     def scales(self) -> list[Scale]:
         """Scales and offsets from stored values to radians or metres."""
-        return shifted(self.units, self.feature.offsets, self.feature.key)
+        return add_offsets(self.units, self.feature.offsets, self.feature.key)
 
     @property
     def raw(self) -> set[str]:
@@ -73,19 +73,19 @@ class JointColumns:
         return {name for name, unit in named if unit == "raw"}
 
     def values(self, stored: np.ndarray[Any, Any], **where: Any) -> np.ndarray[Any, Any]:
-        """Stored values (T, width) in radians and metres."""
-        called = self.feature.names or self.names or self.feature.called
+        """Convert stored values (T, width) to radians and metres."""
+        called = self.feature.names or self.names or self.feature.labels
         values = convert(stored, called, self.units, self.feature.key, **where)
         return values if self.feature.offsets is None else values + self.feature.offsets
 
 
 def joint_feature(layout: Layout, joints: str | None = None) -> str:
-    """The feature that holds the joints.
+    """Find the feature that holds the joints.
 
     Parameters
     ----------
     layout : Layout
-        Of the data set.
+        Metadata of the data set.
     joints : str, optional
         Its name; ``"measured"`` or ``"commanded"`` for the usual one of states or of actions.
         The default is the first that there is of both.
@@ -111,7 +111,7 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
 
 
 def commanded_joints(layout: Layout, key: str) -> Iterator[Finding]:
-    """The finding that commanded joints are read by default; none where ``key`` is measured."""
+    """Report that commanded joints are read by default; nothing where ``key`` is measured."""
     if key not in COMMANDED:
         return
     others = [
@@ -131,36 +131,41 @@ def commanded_joints(layout: Layout, key: str) -> Iterator[Finding]:
 
 
 def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ...] | None:
-    """Name of each value: the robot's where it is a joint of it, else the data set's.
+    """Name each value: as the robot where it is a joint of it, else as the data set.
 
     Raises
     ------
     DatasetError
         If they are not distinct, or do not fit what is ``given`` or the robot.
     """
-    names, count = feature.names, feature.width
+    count = feature.width
     if given == "robot":
         if robot is None:
             raise DatasetError("joint_names='robot' needs a robot", column=feature.key)
-        given = tuple(robot.joint_names)
-    if isinstance(given, Mapping) or given is None:
-        if feature.misnamed:
-            message = f"its values cannot be distinguished: {feature.misnamed}. {NAME_ALL}"
-            raise DatasetError(message, check="joints", column=feature.key)
-        for name in given or ():
-            if name not in (names or ()):
-                message = f"joint_names has {name!r}; the values are called {names}"
-                raise DatasetError(message, column=feature.key)
-        names = names and tuple((given or {}).get(name, name) for name in names)
+        names: tuple[str, ...] | None = tuple(robot.joint_names)
+    elif isinstance(given, Mapping) or given is None:
+        names = _rename_values(feature, given or {})
     else:
         names = (given,) if isinstance(given, str) else tuple(given)
-    if names is not None and (len(names) != count or len(set(names)) < count):
+    if names is not None and not len(names) == len({*names}) == count:
         message = f"joint_names must give {count} different names, got {len(names)}: {names}"
         raise DatasetError(message, column=feature.key)
-    return names if robot is None else _robots_names(feature, names, robot)
+    return names if robot is None else _match_robot(feature, names, robot)
 
 
-def _robots_names(
+def _rename_values(feature: Feature, renamed: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Return the names of the metadata, some of them replaced."""
+    if feature.misnamed:
+        message = f"its values cannot be distinguished: {feature.misnamed}. {NAME_ALL}"
+        raise DatasetError(message, check="joints", column=feature.key)
+    for name in renamed:
+        if name not in (feature.names or ()):
+            message = f"joint_names has {name!r}; the values are called {feature.names}"
+            raise DatasetError(message, column=feature.key)
+    return feature.names and tuple(renamed.get(name, name) for name in feature.names)
+
+
+def _match_robot(
     feature: Feature, names: tuple[str, ...] | None, robot: Any
 ) -> tuple[str, ...]:
     if names is None and feature.width == len(robot.joint_names) == 1:
@@ -173,26 +178,30 @@ def _robots_names(
     return tuple(matched.get(name, name) for name in names)
 
 
-def _units(
+def _choose_units(
     feature: Feature, final: Sequence[str] | None, units: Units, robot: Any
 ) -> tuple[Unit, ...]:
-    """A unit may be given by the data set's name or by the robot's."""
-    final = final or feature.called
+    """Choose units: given ones, by the data set's name or the robot's, before declared ones."""
+    final = final or feature.labels
     stored = feature.names or final
     declared = feature.units or ("auto",) * feature.width
     chosen = units_of(units, stored, final, robot, feature.key)
-    others = [
-        f"{name!r} in {declares!r}, not {unit!r}"
-        for name, unit, declares in zip(stored, chosen, declared, strict=True)
-        if unit != "auto"
-        and declares not in ("auto", "raw")
-        and as_scale(unit, feature.key) != as_scale(declares, feature.key)
-    ]
-    if others:
-        differ = f"the set declares {', '.join(others)}; what was given counts"
+    differing, resolved = list[str](), list[Unit]()
+    joints = getattr(robot, "joint_names", final)
+    for name, joint, given, known in zip(stored, final, chosen, declared, strict=True):
+        if _differ(given, known, feature.key):
+            differing.append(f"{name!r} in {known!r}, not {given!r}")
+        # values of no joint are only seen by functions that find events
+        unknown = "auto" if joint in joints else "raw"
+        resolved.append(next((unit for unit in (given, known) if unit != "auto"), unknown))
+    if differing:
+        differ = f"the set declares {', '.join(differing)}; what was given counts"
         warnings.warn(f"column {feature.key!r}: {differ}", DatasetWarning, stacklevel=2)
-    # values of no joint are only seen by functions that find events
-    mine = {*(final if robot is None else robot.joint_names)}
-    resolved = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
-    pairs = zip(resolved, final, strict=True)
-    return tuple("raw" if unit == "auto" and f not in mine else unit for unit, f in pairs)
+    return tuple(resolved)
+
+
+def _differ(given: Unit, declared: str, column: str) -> bool:
+    """Check if a given unit contradicts the declared one."""
+    if given == "auto" or declared in ("auto", "raw"):
+        return False
+    return as_scale(given, column) != as_scale(declared, column)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = ["FramePose", "LinkPose", "MeasuredPoses"]
 
@@ -55,7 +58,7 @@ class FramePose:
     feature : str
         Name of the feature.
     columns : sequence of int or str, or slice, optional
-        Which of its values: the position's three, then the rotation's, by place or by name.
+        Values of the feature: the position's three, then the rotation's, by place or by name.
         By default those that are called ``<frame>.x``, ...; all where none are so called.
     rotation : {"wxyz", "xyzw", "rotvec", "euler", "yaw", None}, default="wxyz"
         How the orientation is written: a quaternion, w first or last; a rotation vector;
@@ -91,7 +94,7 @@ class FramePose:
             )
 
     def select(self, name: str, feature: Feature) -> list[int]:
-        """Positions of the values that make frame ``name``, checked for number."""
+        """Select the positions of the values that make frame ``name``, checked for number."""
         needed = 3 + ROTATIONS[self.rotation]
         places = list(range(feature.width))
         if isinstance(self.columns, slice):
@@ -125,7 +128,7 @@ class FramePose:
         raise DatasetError(f"there is no value {column!r} among {among}", column=self.feature)
 
     def frame(self, values: Array, places: list[int], **where: Any) -> Frame:
-        """The frame of the values at ``places`` of a feature's (T, width).
+        """Make the frame of the values at ``places`` of a feature's (T, width).
 
         Raises
         ------
@@ -196,8 +199,9 @@ class MeasuredPoses:
         Parameters
         ----------
         name : str
-            Of the frame.
+            Name of the frame, and of its columns where a table has several.
         path : str or Path
+            The table's file.
         wanted, known : sequence of int
             Episodes that are to be read, and all of the set.
 
@@ -210,16 +214,12 @@ class MeasuredPoses:
         where: dict[str, Any] = {"file": path}
         try:
             table = read_table(path)
-            used = _pose_columns(name, table.columns)
+            used = _find_pose_columns(name, table.columns)
             if table.empty:
                 raise DataError("the table has no rows")
             episodes = numbers(table, [used.pop("episode")[0]])[:, 0]
-            if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
-                there = f"{min(known)} to {max(known)}, as 'tpgmm dataset info' counts"
-                raise DataError(f"rows are for episodes {listed(strange)}, the set has {there}")
+            _check_episodes(episodes, known)
             time = used.pop("time", ("", 1.0))[0]
-            columns, factors = zip(*used.values(), strict=True)
-            pose = FramePose(" ".join(columns), None, WRITTEN[" ".join(used)], None)
             poses, times = dict[int, Frame](), dict[int, torch.Tensor]()
             for episode in wanted:
                 where = {"file": path, "episode": episode}
@@ -230,9 +230,7 @@ class MeasuredPoses:
                         "where an object moves, with a column 'time' [s]. Episodes without a "
                         "pose can be left out (episodes=, --episodes)"
                     )
-                values = numbers(rows, columns) * factors
-                _check_units(values, list(used))
-                poses[episode] = pose.frame(values, list(range(len(columns))))
+                poses[episode] = _read_poses(rows, used)
                 if poses[episode].batch_shape:
                     times[episode] = torch.from_numpy(numbers(rows, [time])[:, 0])
                     if bool((times[episode].diff() <= 0).any()):
@@ -242,10 +240,10 @@ class MeasuredPoses:
         return cls(poses, times, str(path))
 
     @classmethod
-    def given(
+    def take(
         cls, name: str, frames: Any, wanted: Sequence[int], known: Collection[int]
     ) -> Self:
-        """Frames by episode, or one for each episode that is read; the rest as :meth:`read`.
+        """Take frames by episode, or one for each that is read; the rest as :meth:`read`.
 
         Raises
         ------
@@ -267,7 +265,7 @@ class MeasuredPoses:
         return cls(several)
 
     def frame(self, name: str, time: Array, **where: Any) -> Frame:
-        """The frame in an episode whose steps are at ``time`` [s].
+        """Return the frame in an episode whose steps are at ``time`` [s].
 
         Raises
         ------
@@ -291,29 +289,56 @@ class MeasuredPoses:
         return pose
 
 
-def _pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str, float]]:
-    """Column and factor of episode, time, and the parts of the pose of ``name`` in order."""
+def _check_episodes(episodes: Array, known: Collection[int]) -> None:
+    if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
+        there = f"{min(known)} to {max(known)}, as 'tpgmm dataset info' counts"
+        raise DataError(f"rows are for episodes {listed(strange)}, the set has {there}")
+
+
+def _read_poses(rows: pd.DataFrame, used: Mapping[str, tuple[str, float]]) -> Frame:
+    """Read the pose in one row, or one for each of several, from columns by its parts."""
+    columns, factors = zip(*used.values(), strict=True)
+    values = numbers(rows, columns) * factors
+    _check_units(values, list(used))
+    pose = FramePose(" ".join(columns), None, WRITTEN[" ".join(used)], None)
+    return pose.frame(values, list(range(len(columns))))
+
+
+def _parse_column(column: Any) -> tuple[str, str, float]:
+    """Parse a column into the object's name, the part of its pose and a factor."""
+    text = re.sub(PLACE, "", str(column).strip(" /").lower())
+    match = re.fullmatch(COLUMN, re.sub(TURN, "q", text))
+    thing, part, unit = match.groups() if match else ("", "", "")
+    return thing or "", part, UNITS.get(unit, 1.0)
+
+
+def _find_pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str, float]]:
+    """Find column and factor of episode, time, and the parts of the pose in order."""
     found: dict[str, tuple[str, float]] = {}
     known, wrong = {"episode", "time", *" ".join(WRITTEN).split()}, []
     for column in columns:
-        text = re.sub(PLACE, "", str(column).strip(" /").lower())
-        match = re.fullmatch(COLUMN, re.sub(TURN, "q", text))
-        thing, part, unit = match.groups() if match else ("", "", "")
-        ours = (thing or name.lower()) == name.lower()
+        thing, part, factor = _parse_column(column)
+        ours = thing in ("", name.lower())
         if part not in known or (ours and part in found):
             wrong.append(column)
         elif ours:
-            found[part] = column, UNITS.get(unit, 1.0)
-    ordered = [p for p in WRITTEN if {*p.split(), "episode"} == {*found} - {"time"}]
-    if wrong or not ordered:
+            found[part] = column, factor
+    ordered = _find_form(found)
+    if wrong or ordered is None:
         strange = f", and {wrong} are unknown or there twice" if wrong else ""
         raise DataError(
             f"the table has columns {list(columns)}{strange}. Name them episode, x, y, z (or "
             f"{name}.x, ...), and yaw, or qw, qx, qy, qz; time if it moves; x_mm or yaw_deg in "
             "other units. Leave others out"
         )
-    parts = ("episode", "time", *ordered[0].split())
-    return {part: found[part] for part in parts if part in found}
+    parts = ("episode", "time", *ordered.split())
+    return {part: found[part] for part in sorted(found, key=parts.index)}
+
+
+def _find_form(parts: Collection[str]) -> str | None:
+    """Find the parts in the order of a form that poses are written in."""
+    forms = {frozenset(form.split()): form for form in WRITTEN}
+    return forms.get(frozenset(parts) - {"episode", "time"}) if "episode" in parts else None
 
 
 def _check_units(values: Array, parts: Sequence[str]) -> None:
@@ -403,7 +428,7 @@ class LinkPose:
         return f"{self.link}@{getattr(self.event, '__name__', self.event)}"
 
     def time(self, demonstration: Demonstration, **where: Any) -> float:
-        """When the event is [s].
+        """Find when the event is [s].
 
         Raises
         ------
@@ -423,7 +448,7 @@ class LinkPose:
             raise DatasetError(message, check="events", **where) from error
 
     def frame(self, demonstration: Demonstration, robot: Any, time: float) -> Frame:
-        """The pose of the link, or of the object in it, at the step nearest to ``time``."""
+        """Compute the pose of the link, or of the object in it, nearest to ``time``."""
         step = int((demonstration.time - time).abs().argmin())
         state = robot.state(demonstration.reordered(robot.joint_names).joints[step])
         pose = Frame(state.position(self.link), state.orientation(self.link))

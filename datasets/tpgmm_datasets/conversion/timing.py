@@ -17,7 +17,7 @@ __all__ = ["resample", "trim"]
 
 
 def resample(demonstration: Demonstration, rate: float) -> Demonstration:
-    """The demonstration at another rate; it starts at 0 then.
+    """Resample a demonstration at another rate; it starts at 0 then.
 
     Joints and positions are interpolated linearly, quaternions (those among the joints too,
     known by their names ``*.qw`` ... ``*.qz``) along the great arc. Nothing is smoothed.
@@ -25,7 +25,7 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     Parameters
     ----------
     demonstration : Demonstration
-        Any.
+        It stays as it is.
     rate : float
         Steps per second.
 
@@ -72,7 +72,7 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     wrenches = {link: linear(wrench) for link, wrench in demonstration.wrenches.items()}
     return replace(
         demonstration, time=target, joints=joints, frames=frames, events=events,
-        wrenches=wrenches,
+        wrenches=wrenches
     )  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     Parameters
     ----------
     demonstration : Demonstration
-        Any.
+        It stays as it is.
     speed : float
         Idle is where every joint is slower than this [rad/s or m/s]. Events are kept in.
     **where

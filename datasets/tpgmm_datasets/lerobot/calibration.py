@@ -31,7 +31,7 @@ REMEDY = (
 
 
 def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[str, Scale]:
-    """The scales of recorded values that a calibration tells.
+    """Read the scales of recorded values that a calibration tells.
 
     The angle 0 is the middle of a motor's range, as in LeRobot's degrees.
 
@@ -40,7 +40,7 @@ def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[s
     calibration : str, Path or mapping of str to these
         A file, or files by prefix of the motors' names.
     names : tuple of str
-        Of the recorded values, ``shoulder_pan.pos`` for the motor ``shoulder_pan``.
+        Names of the recorded values, ``shoulder_pan.pos`` for the motor ``shoulder_pan``.
 
     Returns
     -------
@@ -97,9 +97,9 @@ def _scale(name: str, motor: Any, file: str | Path) -> Scale:
     if drive_mode:
         message = (
             f"motor {name!r} has the drive mode {drive_mode}. Whether LeRobot turned it round "
-            f"depends on its bus: say units={{{name!r}: Scale.calibrated({low}, {high}, "
+            f"depends on its bus: say units={{{name!r}: Scale.from_calibration({low}, {high}, "
             f"stored={stored})}} for Dynamixel, stored={stored[::-1]} for Feetech, and leave "
             "the motor out of the file"
         )
         raise DatasetError(message, file=file)
-    return Scale.calibrated(low, high, stored=stored)
+    return Scale.from_calibration(low, high, stored=stored)

@@ -34,15 +34,7 @@ from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 
-__all__ = [
-    "action_column",
-    "demonstration_columns",
-    "feature_table",
-    "features_of",
-    "frame_columns",
-    "pose_values",
-    "with_frames",
-]
+__all__ = ["features_of", "with_frames"]
 
 
 Array = np.ndarray[Any, Any]
@@ -64,7 +56,7 @@ TIME_TOLERANCE = 0.01
 def features_of(
     demonstrations: Sequence[Demonstration], dtype: str, units: Mapping[str, str] | None = None
 ) -> Features:
-    """Features in ``info.json`` of these demonstrations; parameters as of ``save_lerobot``.
+    """Declare demonstrations for ``info.json``; parameters as of ``save_lerobot``.
 
     Raises
     ------
@@ -72,36 +64,43 @@ def features_of(
         If they have no joints, a name cannot be stored, or ``units`` name something else.
     """
     first = demonstrations[0]
-    if first.n_joints == 0:
-        raise DatasetError("demonstrations without joints cannot be stored: LeRobot needs them")
-    names = None if first.joint_names is None else list(first.joint_names)
-    given = dict(units or {})
-    for name, unit in given.items():
-        if name not in (names or ()) or unit not in JOINT_UNITS:
-            known = f"the joints are {names}, their units in demonstrations {list(JOINT_UNITS)}"
-            raise DatasetError(f"units gives {name!r} the unit {unit!r}; {known}")
-    listed = [given.get(name, "rad") for name in names or [""] * first.n_joints]
-    joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
+    joints = _declare_joints(first, dtype, units or {})
     features = {STATE: joints}
     if first.frames:
         features[ENVIRONMENT] = with_frames(None, list(first.frames), dtype)
     for link in first.wrenches:
-        features[WRENCH + link] = _vector(dtype, 6, list(WRENCH_PARTS), WRENCH_UNITS)
+        features[WRENCH + link] = _vector(dtype, 6, WRENCH_PARTS, WRENCH_UNITS)
     for event in sorted({event for item in demonstrations for event in item.events}):
         if "/" in event or not event:
             raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")
         features[EVENT + event] = {"dtype": "bool", "shape": [1], "names": None}
     features[ACTION] = joints
     for key in BOOKKEEPING:
-        kind = "float32" if key == "timestamp" else "int64"
-        features[key] = {"dtype": kind, "shape": [1], "names": None}
+        features[key] = {"dtype": "int64", "shape": [1], "names": None}
+    features["timestamp"]["dtype"] = "float32"
     return features
+
+
+def _declare_joints(
+    demonstration: Demonstration, dtype: str, units: Mapping[str, str]
+) -> dict[str, Any]:
+    """Declare the joints, in radians where no unit is given."""
+    width, names = demonstration.n_joints, demonstration.joint_names
+    if width == 0:
+        raise DatasetError("demonstrations without joints cannot be stored: LeRobot needs them")
+    for name, unit in units.items():
+        if name not in (names or ()) or unit not in JOINT_UNITS:
+            known = f"their units in demonstrations {list(JOINT_UNITS)}"
+            joints = f"the joints are {names and list(names)}"
+            raise DatasetError(f"units gives {name!r} the unit {unit!r}; {joints}, {known}")
+    listed = [units.get(name, "rad") for name in names or ("",) * width]
+    return _vector(dtype, width, names, with_pose_units(names, listed))
 
 
 def with_frames(
     old: Feature | None, frames: Sequence[str], dtype: str = "float32"
 ) -> dict[str, Any]:
-    """Declaration of ``observation.environment_state``, with frames behind the old values.
+    """Declare ``observation.environment_state``, with frames behind the old values.
 
     Raises
     ------
@@ -120,15 +119,16 @@ def with_frames(
 
 
 def _vector(
-    dtype: str, width: int, names: list[str] | None, units: tuple[str, ...]
+    dtype: str, width: int, names: Sequence[str] | None, units: Sequence[str]
 ) -> dict[str, Any]:
+    names = None if names is None else list(names)
     return {"dtype": dtype, "shape": [width], "names": names, "info": {"units": list(units)}}
 
 
 def demonstration_columns(
     demonstration: Demonstration, number: int, features: Mapping[str, Any], fps: float
 ) -> dict[str, Array]:
-    """The values of one episode by column, each of shape (T, width).
+    """Return the values of one episode by column, each of shape (T, width).
 
     ``number`` is how errors call the demonstration. Time starts at 0 in the set.
 
@@ -138,16 +138,7 @@ def demonstration_columns(
         If time does not follow ``fps``, or a value does not fit into the column's type.
     """
     steps = len(demonstration)
-    grid = np.arange(steps) / fps
-    time = as_array(demonstration.time - demonstration.time[0])
-    off = np.abs(time - grid)
-    if off.max() > TIME_TOLERANCE / fps:
-        at = int(off.argmax())
-        raise DatasetError(
-            f"demonstration {number} is not sampled at {fps:g} Hz: step {at} is at "
-            f"{time[at]:.6g} s instead of {grid[at]:.6g} s. Resample it, "
-            "tpgmm_datasets.resample(demonstration, fps)"
-        )
+    grid = _check_grid(demonstration, number, fps)
     joints = as_array(demonstration.joints)
     ahead = np.concatenate((joints[1:], joints[-1:]))
     columns: dict[str, Array] = {STATE: joints, ACTION: ahead}
@@ -158,19 +149,32 @@ def demonstration_columns(
         columns[ENVIRONMENT] = np.concatenate(poses, axis=1)
     for link, wrench in demonstration.wrenches.items():
         columns[WRENCH + link] = as_array(wrench)
-    for key in features:
-        if key.startswith(EVENT):
-            columns[key] = _flag(demonstration, key.removeprefix(EVENT), fps)
+    columns |= {k: _flag_event(demonstration, k, fps) for k in features if k.startswith(EVENT)}
     columns["timestamp"] = grid[:, None]
     columns["frame_index"] = np.arange(steps)[:, None]
-    kinds = {key: features[key]["dtype"] for key in features if key in columns}
-    return {key: _cast(columns[key], kind, key, number) for key, kind in kinds.items()}
+    keys = [key for key in features if key in columns]
+    return {key: _cast(columns[key], features[key]["dtype"], key, number) for key in keys}
+
+
+def _check_grid(demonstration: Demonstration, number: int, fps: float) -> Array:
+    """Return the times of steps at ``fps`` from 0, if the demonstration has these."""
+    grid: Array = np.arange(len(demonstration)) / fps
+    time = as_array(demonstration.time - demonstration.time[0])
+    off = np.abs(time - grid)
+    if off.max() > TIME_TOLERANCE / fps:
+        at = int(off.argmax())
+        raise DatasetError(
+            f"demonstration {number} is not sampled at {fps:g} Hz: step {at} is at "
+            f"{time[at]:.6g} s instead of {grid[at]:.6g} s. Resample it, "
+            "tpgmm_datasets.resample(demonstration, fps)"
+        )
+    return grid
 
 
 def action_column(
     commanded: Demonstration, number: int, features: Mapping[str, Any]
 ) -> dict[str, Array]:
-    """The column ``action`` where the references are known, as the joints of ``commanded``."""
+    """Return the column ``action``, as the joints of ``commanded``."""
     feature = features[ACTION]
     if commanded.n_joints != feature["shape"][0]:
         counts = f"{feature['shape'][0]} joints and actions of {commanded.n_joints} values"
@@ -181,19 +185,20 @@ def action_column(
 def frame_columns(
     values: Array, frames: Mapping[str, Frame], features: Mapping[str, Any], number: int
 ) -> dict[str, Array]:
-    """The column of :func:`with_frames`: the old values (T, width), then the poses."""
+    """Return the column of :func:`with_frames`: the old values (T, width), then the poses."""
     poses = [pose_values(frame, len(values)) for frame in frames.values()]
     joined = np.concatenate([values, *poses], axis=1)
     return {ENVIRONMENT: _cast(joined, features[ENVIRONMENT]["dtype"], ENVIRONMENT, number)}
 
 
 def pose_values(frame: Frame, rows: int) -> Array:
-    """Position and quaternion of a frame at each row, shape (rows, 7)."""
+    """Return position and quaternion of a frame at each row, shape (rows, 7)."""
     pose = np.concatenate([as_array(frame.position), as_array(frame.orientation)], axis=-1)
     return np.broadcast_to(pose, (rows, len(POSE_PARTS)))
 
 
-def _flag(demonstration: Demonstration, event: str, fps: float) -> Array:
+def _flag_event(demonstration: Demonstration, column: str, fps: float) -> Array:
+    event = column.removeprefix(EVENT)
     flag = np.zeros((len(demonstration), 1), dtype=bool)
     if event in demonstration.events:
         since = demonstration.events[event] - float(demonstration.time[0])
@@ -211,7 +216,7 @@ def _cast(values: Array, dtype: str, key: str, number: int) -> Array:
 
 
 def feature_table(columns: Mapping[str, Array], features: Mapping[str, Any]) -> pa.Table:
-    """The rows of one episode, in the arrow types that LeRobot uses."""
+    """Make the rows of one episode, in the arrow types that LeRobot uses."""
     arrays = {}
     for key, feature in features.items():
         values = np.ascontiguousarray(columns[key]).reshape(-1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, summed_up
+from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, list_problems
 from tpgmm_datasets.lerobot.files import METADATA_KEY
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
 from tpgmm_datasets.lerobot.parquet import MOST_IN_EPISODE, episode_tables, open_parquet
@@ -76,8 +76,8 @@ class Relaxed:
         self.problems.append(problem)
 
     def warn(self) -> None:
-        """Tell of the problems that were kept since, those that are alike as one."""
-        for text in summed_up(self.problems):
+        """Warn of the problems that were kept since, those that are alike as one."""
+        for text in list_problems(self.problems):
             # the caller is some levels up, how many depends on the way
             warnings.warn(f"left out or not checked: {text}", DatasetWarning, stacklevel=3)
         self.problems = []
@@ -103,45 +103,59 @@ def read_episodes(
 def _read_file(
     layout: Layout, episodes: Sequence[Episode], features: Sequence[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
-    file, keys = episodes[0].file, [feature.key for feature in features]
+    file, needed = episodes[0].file, ["episode_index", *(feature.key for feature in features)]
     expected = {episode.index: episode for episode in episodes}
     listed = {one.index: one.length for one in layout.episodes if one.file == file}
-    seen: set[int] = set()
-    path, needed = layout.root / file, ["episode_index", *keys]
-    with open_parquet(path, layout.root, needed, BOOKKEEPING) as parquet:
+    with open_parquet(layout.root / file, layout.root, needed, BOOKKEEPING) as parquet:
         schema = parquet.schema_arrow
-        for problem in _declaration_problems(layout, file, schema.metadata or {}):
+        for problem in _compare_declarations(layout, file, schema.metadata):
             policy(problem)
-        counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
+        counters = set(BOOKKEEPING[:4]).intersection(schema.names)
         values = len(counters) + sum(feature.width for feature in features)
-        rows, longest = parquet.metadata.num_rows, max(listed.values())
-        if (longest + max(rows - sum(listed.values()), 0)) * values > MOST_IN_EPISODE:
-            message = (
-                f"it has {rows} rows of {values} values, for episodes of at most {longest}"
-            )
-            message += f"; of one at most {MOST_IN_EPISODE} values are read"
-            raise DatasetError(message, check="metadata", file=file)
-        columns = list(dict.fromkeys([*counters, *keys]))
-        for index, table in episode_tables(parquet, file, columns):
-            if index in seen:
-                message = "its rows are there twice, or are not together"
-                policy(DatasetError(message, check="duplicates", file=file, episode=index))
-            elif index in expected:
-                yield from _rows(layout, expected[index], table, features, policy)
-            elif index not in listed:
-                message = "the metadata do not list it in this file"
-                policy(DatasetError(message, check="metadata", file=file, episode=index))
-            seen.add(index)
-    for index in sorted(set(expected) - seen):
-        message = f"the metadata list it with {expected[index].length} rows, the file has none"
+        _check_size(file, parquet.metadata.num_rows, values, listed.values())
+        tables = episode_tables(parquet, file, sorted(counters.union(needed)))
+        for index, table in _check_listing(tables, file, listed, policy):
+            if index in expected:
+                yield from _read_rows(layout, expected.pop(index), table, features, policy)
+    for index, episode in sorted(expected.items()):
+        message = f"the metadata list it with {episode.length} rows, the file has none"
         policy(DatasetError(message, check="metadata", file=file, episode=index))
 
 
-def _declaration_problems(
-    layout: Layout, file: Path, metadata: Mapping[bytes, bytes]
+def _check_listing(
+    tables: Iterable[tuple[int, pa.Table]], file: Path, listed: Collection[int], policy: Policy
+) -> Iterator[tuple[int, pa.Table]]:
+    """Yield the rows of episodes that the metadata list in a file, those of each once."""
+    seen: set[int] = set()
+    for index, table in tables:
+        if index in seen:
+            message = "its rows are there twice, or are not together"
+            policy(DatasetError(message, check="duplicates", file=file, episode=index))
+        elif index not in listed:
+            message = "the metadata do not list it in this file"
+            policy(DatasetError(message, check="metadata", file=file, episode=index))
+        else:
+            yield index, table
+        seen.add(index)
+
+
+def _check_size(file: Path, rows: int, values: int, lengths: Collection[int]) -> None:
+    """Refuse rows of so many values that an episode would fill the memory."""
+    longest = max(lengths)
+    if (longest + max(rows - sum(lengths), 0)) * values > MOST_IN_EPISODE:
+        raise DatasetError(
+            f"it has {rows} rows of {values} values, for episodes of at most {longest}; of one "
+            f"at most {MOST_IN_EPISODE} values are read",
+            check="metadata",
+            file=file,
+        )
+
+
+def _compare_declarations(
+    layout: Layout, file: Path, metadata: Mapping[bytes, bytes] | None
 ) -> Iterator[DatasetError]:
-    """Differences between ``info.json`` and what our writer left in the data file."""
-    if METADATA_KEY not in metadata:
+    """Yield differences between ``info.json`` and what our writer left in the data file."""
+    if not metadata or METADATA_KEY not in metadata:
         return
     try:
         declared = json.loads(metadata[METADATA_KEY])
@@ -157,19 +171,19 @@ def _declaration_problems(
             yield DatasetError(message, check="metadata", file=file, column=name)
 
 
-def _rows(
+def _read_rows(
     layout: Layout,
     episode: Episode,
     table: pa.Table,
     features: Sequence[Feature],
     policy: Policy,
 ) -> Iterator[EpisodeRows]:
-    """The checked arrays of an episode; none if it has a problem that the policy lets pass."""
-    problems = list(_row_problems(layout, episode, table))
+    """Yield the checked arrays of an episode; none if a problem of it is let pass."""
+    problems = list(_check_rows(layout, episode, table))
     values = {}
     for feature in features:
         try:
-            values[feature.key] = _column_values(table, feature, episode)
+            values[feature.key] = _read_values(table, feature, episode)
         except DatasetError as error:
             problems.append(error)
     for problem in problems:
@@ -179,21 +193,15 @@ def _rows(
         yield EpisodeRows(episode, row_times(stamps, len(table), layout.fps), values)
 
 
-def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
-    """All contradictions between the rows of an episode and the metadata, and in time."""
+def _check_rows(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
+    """Yield contradictions between the rows of an episode and the metadata, and in time."""
     where, rows = episode.where, len(table)
     if rows != episode.length:
         message = f"the metadata give {episode.length} rows, the file has {rows}"
         yield DatasetError(message, check="metadata", **where)
     for name, start in {"frame_index": 0, "index": episode.start}.items():
-        if name not in table.column_names or start is None:
-            continue
-        column = table[name]
-        if not pa.types.is_integer(column.type) or column.null_count:
-            yield DatasetError("not all are whole numbers", column=name, **where)
-        elif (column.to_numpy() != np.arange(start, start + rows)).any():
-            message = f"it does not count from {start} in steps of one"
-            yield DatasetError(message, check="metadata", column=name, **where)
+        if name in table.column_names and start is not None:
+            yield from _check_counter(table[name], start, where | {"column": name})
     if "timestamp" in table.column_names:
         column = table["timestamp"]
         if not pa.types.is_floating(column.type) or column.null_count:
@@ -202,10 +210,19 @@ def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator
             yield from time_problems(column.to_numpy(), layout.fps, **where)
 
 
-def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
-    """The values of a feature, shape (T, width), without a copy where arrow allows."""
+def _check_counter(column: Any, start: int, where: Mapping[str, Any]) -> Iterator[DatasetError]:
+    """Check that a column counts from ``start`` in steps of one."""
+    if not pa.types.is_integer(column.type) or column.null_count:
+        yield DatasetError("not all are whole numbers", **where)
+    elif (column.to_numpy() != np.arange(start, start + len(column))).any():
+        message = f"it does not count from {start} in steps of one"
+        yield DatasetError(message, check="metadata", **where)
+
+
+def _read_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
+    """Read the values of a feature, shape (T, width), without a copy where arrow allows."""
     where, rows = episode.where | {"column": feature.key}, len(table)
-    flat = _flat(table[feature.key].combine_chunks(), where)
+    flat = _flatten(table[feature.key].combine_chunks(), where)
     declared, stored = feature.dtype, str(flat.type)
     if stored != ARROW_NAMES.get(declared, declared) and (declared, stored) not in WIDER:
         message = f"it holds {stored}, info.json declares {declared}"
@@ -217,14 +234,14 @@ def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array
     values: Array = flat.to_numpy(zero_copy_only=False).reshape(rows, feature.width)
     if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
         row, place = np.argwhere(~finite)[0].tolist()
-        first = f"row {row}, {feature.called[place]}"
+        first = f"row {row}, {feature.labels[place]}"
         message = f"{(~finite).sum()} values are NaN or infinite, the first: {first}"
         raise DatasetError(message, check="nan", **where)
     return values
 
 
-def _flat(column: Any, where: Mapping[str, Any]) -> Any:
-    """All values of an arrow column of numbers, or of equally long lists of them."""
+def _flatten(column: Any, where: Mapping[str, Any]) -> Any:
+    """Flatten an arrow column of numbers, or of equally long lists of them."""
     if isinstance(column.type, pa.ExtensionType):
         column = column.storage
     nulls = column.null_count

@@ -16,17 +16,17 @@ METADATA_KEY = b"tpgmm_datasets"
 
 
 def file_path(template: str, chunk: int, file: int) -> str:
-    """The path of a file, of a ``template`` with ``chunk_index`` and ``file_index``."""
+    """Return the path of a file, of a ``template`` with ``chunk_index`` and ``file_index``."""
     return template.format(chunk_index=chunk, file_index=file)
 
 
 def chunked_files(folder: Path) -> list[Path]:
-    """The parquet files in the chunks of a folder; without hidden ones."""
+    """List the parquet files in the chunks of a folder, without hidden ones."""
     return sorted(folder.glob("[!.]*/[!.]*.parquet"))
 
 
 def free_place(root: Path, template: str, chunk_files: int) -> tuple[int, int]:
-    """Numbers of chunk and file of the first that is not in the folder.
+    """Find numbers of chunk and file of the first that is not in the folder.
 
     Parameters
     ----------
@@ -51,8 +51,9 @@ def write_tables(
     Parameters
     ----------
     path : Path
+        The file; its folder is made.
     tables : iterable of pyarrow.Table
-        Of one schema.
+        Rows of one schema.
     metadata : dict of bytes to bytes, optional
         Kept in the file.
     """

@@ -20,7 +20,7 @@ PATTERNS = ["meta/**", "data/**"]
 
 
 def local_folder(path: str | Path) -> Path:
-    """The folder of a data set.
+    """Find the folder of a data set.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,10 @@ MOST_VALUES = 100_000
 #: Indices beyond this are mistakes: floats could not count them.
 LARGEST_INDEX = 2**53
 HIGHEST_FPS = 1e6
-EPISODE_COLUMNS = (
+#: Of a listed episode: the first two in both layouts, all in v3.0.
+ROW_NUMBERS = (
     "episode_index",
     "length",
-    "tasks",
     "dataset_from_index",
     "dataset_to_index",
     "data/chunk_index",
@@ -79,13 +79,13 @@ class Feature:
         return math.prod(self.shape)
 
     @property
-    def called(self) -> tuple[str, ...]:
+    def labels(self) -> tuple[str, ...]:
         """Name of its values in messages."""
         return self.names or tuple(f"value {i}" for i in range(self.width))
 
     @property
     def is_camera(self) -> bool:
-        """Whether it is a video or image, which this project does not read."""
+        """True of a video or image, which this project does not read."""
         return self.dtype in CAMERAS
 
 
@@ -156,7 +156,7 @@ class Layout:
     problems: tuple[DatasetError, ...] = ()
 
     def feature(self, key: str) -> Feature:
-        """The declared feature of that name.
+        """Return the declared feature of that name.
 
         Raises
         ------
@@ -192,7 +192,7 @@ def open_layout(root: Path) -> Layout:
         raise DatasetError(message, file=INFO)
     features = _features(info)
     modern = version == "v3.0"
-    rows = _listed_episodes(root) if modern else _json_lines(root, "meta/episodes.jsonl")
+    rows = _list_episodes(root) if modern else _json_lines(root, "meta/episodes.jsonl")
     episodes = sorted((_episode(info, *row, modern) for row in rows), key=lambda e: e.index)
     tasks = _tasks(root, modern)
     return Layout(
@@ -240,7 +240,7 @@ def _features(info: Mapping[str, Any]) -> dict[str, Feature]:
 
 
 def _feature(key: str, entry: Any) -> Feature:
-    entry = entry if isinstance(entry, dict) else {}
+    entry = _as_dict(entry)
     dtype, shape = entry.get("dtype"), entry.get("shape")
     sizes: list[Any] = shape if isinstance(shape, list) else [None]
     if not isinstance(dtype, str) or not all(type(n) is int and n > 0 for n in sizes):
@@ -250,33 +250,38 @@ def _feature(key: str, entry: Any) -> Feature:
     if width > MOST_VALUES and dtype not in CAMERAS:
         message = f"a row has {width} values ({shape!r}); at most {MOST_VALUES} are read"
         raise DatasetError(message, file=INFO, column=key)
-    extra = about if isinstance(about := entry.get("info"), dict) else {}
+    extra = _as_dict(entry.get("info"))
     names, misnamed = value_names(entry.get("names"), width, key)
-    listed, wrong = value_names(extra.get("units"), width, distinct=False)
+    units, wrong = value_names(extra.get("units"), width, distinct=False)
     if wrong:
         message = f"its units cannot be used, {wrong}: mend them, or leave them out"
         raise DatasetError(message, file=INFO, column=key)
-    offsets = extra.get("offsets")
-    if offsets is not None and not _numbers(offsets, width):
+    offsets = _parse_offsets(extra.get("offsets"), width, key)
+    return Feature(key, dtype, tuple(sizes), names, units, misnamed, offsets)
+
+
+def _as_dict(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _parse_offsets(offsets: Any, width: int, key: str) -> tuple[float, ...] | None:
+    """Check that offsets, where there are any, are finite numbers, one for each value."""
+    if offsets is None:
+        return None
+    whole = isinstance(offsets, list) and len(offsets) == width
+    if not whole or not all(type(x) in (int, float) and math.isfinite(x) for x in offsets):
         message = f"its joint offsets are {width} numbers in radians, got {str(offsets)[:80]}"
         raise DatasetError(message, file=INFO, column=key)
-    shifts = None if offsets is None else tuple(map(float, offsets))
-    return Feature(key, dtype, tuple(sizes), names, listed, misnamed, shifts)
+    return tuple(map(float, offsets))
 
 
-def _numbers(values: Any, count: int) -> bool:
-    """Whether these are finite numbers, as many as wanted."""
-    whole = isinstance(values, list) and len(values) == count
-    return whole and all(type(one) in (int, float) and math.isfinite(one) for one in values)
-
-
-def _listed_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _list_episodes(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     files = chunked_files(root / "meta" / "episodes")
     if not files:
         message = "no episodes are listed: never finalised (LeRobotDataset.finalize), or a part"
         raise DatasetError(message, check="missing", file="meta/episodes")
     for path in files:
-        for row in read_columns(path, root, EPISODE_COLUMNS).to_pylist():
+        for row in read_columns(path, root, (*ROW_NUMBERS, "tasks")).to_pylist():
             yield str(path.relative_to(root)), row
 
 
@@ -292,22 +297,27 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
 def _episode(
     info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
 ) -> Episode:
-    whole = [name for name in EPISODE_COLUMNS if name != "tasks"]
-    for name in whole if modern else whole[:2]:
-        if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
-            message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
-            raise DatasetError(message, file=place, column=name)
+    _check_numbers(row, ROW_NUMBERS if modern else ROW_NUMBERS[:2], place)
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
     if not all(isinstance(task, str) for task in tasks):
         raise DatasetError(f"tasks are no text: {tasks!r}", file=place, column="tasks")
-    start = row["dataset_from_index"] if modern else None
-    if modern and (stop := row["dataset_to_index"]) - start != length:
+    if not modern:
+        file = episode_file(info, "data_path", index, None)
+        return Episode(index, length, tuple(tasks), file)
+    start, stop, *numbers = (row[name] for name in ROW_NUMBERS[2:])
+    if stop - start != length:
         message = f"the length is {length} but the rows go from {start} to {stop}"
         raise DatasetError(message, file=place, episode=index)
-    numbers = (row["data/chunk_index"], row["data/file_index"]) if modern else None
-    file = episode_file(info, "data_path", index, numbers)
+    file = episode_file(info, "data_path", index, (numbers[0], numbers[1]))
     return Episode(index, length, tuple(tasks), file, start)
+
+
+def _check_numbers(row: Mapping[str, Any], names: Sequence[str], place: str) -> None:
+    for name in names:
+        if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
+            message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
+            raise DatasetError(message, file=place, column=name)
 
 
 def episode_file(
@@ -317,7 +327,7 @@ def episode_file(
     place: tuple[int, int] | None,
     **texts: str,
 ) -> Path:
-    """The file of an episode, relative to the root, by a template in ``info.json``.
+    """Find the file of an episode, relative to the root, by a template in ``info.json``.
 
     Parameters
     ----------
@@ -326,7 +336,7 @@ def episode_file(
     template : str
         ``"data_path"`` or ``"video_path"``.
     index : int
-        Of the episode.
+        Index of the episode.
     place : (int, int) or None
         Numbers of chunk and file in v3.0; None in v2.1, where an episode has its own file.
     **texts : str

@@ -26,7 +26,7 @@ MOST_IN_EPISODE = 20_000_000
 
 
 @contextmanager
-def _named(file: Path) -> Iterator[None]:
+def _name_errors(file: Path) -> Iterator[None]:
     try:
         yield
     # what pyarrow raises on corrupted bytes is not one class: text that is no UTF-8, sizes
@@ -65,7 +65,7 @@ def open_parquet(
         absent = isinstance(error, FileNotFoundError)
         message = "the file is missing" if absent else str(error)
         raise DatasetError(message, check="missing", file=file) from error
-    with _named(file):
+    with _name_errors(file):
         # buffering ahead would hold the whole file
         parquet = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         present = parquet.schema_arrow.names
@@ -82,7 +82,7 @@ def open_parquet(
 def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
     """Read some columns of a parquet file whole; errors are those of ``open_parquet``."""
     file = path.relative_to(root)
-    with open_parquet(path, root, columns) as parquet, _named(file):
+    with open_parquet(path, root, columns) as parquet, _name_errors(file):
         if (rows := parquet.metadata.num_rows) * len(columns) > MOST_READ:
             message = f"it has {rows} rows; at most {MOST_READ // len(columns)} are read"
             raise DatasetError(message, file=file)
@@ -116,7 +116,7 @@ def episode_tables(
     DatasetError
         If the file is unreadable.
     """
-    with _named(file):
+    with _name_errors(file):
         if parquet.metadata.num_rows <= BATCH_ROWS:
             batches = iter([parquet.read(list(columns))])  # faster than batches
         else:
@@ -139,7 +139,7 @@ def episode_tables(
 
 
 def _next(batches: Iterator[Any], file: Path) -> Any:
-    with _named(file):
+    with _name_errors(file):
         batch = next(batches, None)
         if batch is not None:
             batch.validate(full=True)

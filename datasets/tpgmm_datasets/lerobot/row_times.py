@@ -18,7 +18,7 @@ OFF_GRID, LONGEST_STEP = 0.01, 1.5
 
 
 def time_problems(timestamps: Array, fps: float, **where: Any) -> Iterator[DatasetError]:
-    """Faults of the timestamps of an episode, shape (T,)."""
+    """Yield faults of the timestamps of an episode, shape (T,)."""
     where = {**where, "column": "timestamp"}
     finite = np.isfinite(timestamps)
     if not finite.all():
@@ -47,7 +47,7 @@ def time_problems(timestamps: Array, fps: float, **where: Any) -> Iterator[Datas
 
 
 def row_times(timestamps: Array | None, rows: int, fps: float) -> Array:
-    """Time of each row from the start of the episode [s], float64.
+    """Return the time of each row from the start of the episode [s], float64.
 
     Timestamps that lie on the grid of ``fps``, as nearly all do, are replaced by it: they are
     stored with the seven digits of float32.

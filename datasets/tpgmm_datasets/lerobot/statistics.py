@@ -20,7 +20,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 def episode_statistics(columns: Mapping[str, Array]) -> Statistics:
-    """Minimum, maximum, mean, standard deviation, count and quantiles of one episode.
+    """Compute minimum, maximum, mean, deviation, count and quantiles of one episode.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def _column_statistics(values: Array) -> dict[str, Array]:
 
 
 def merge_statistics(a: Statistics, b: Statistics) -> Statistics:
-    """Statistics of two parts together.
+    """Merge the statistics of two parts.
 
     Everything is exact but the quantiles, which are averages weighted by the number of rows:
     so does LeRobot, and only so can a set grow without being read again.
@@ -68,12 +68,12 @@ def _merge_column(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
 
 
 def stated_range(root: Path, key: str, width: int) -> Array | None:
-    """Smallest and largest values of a column over all episodes, by the metadata.
+    """Read smallest and largest values of a column over all episodes, from the metadata.
 
     Parameters
     ----------
     root : Path
-        Of the data set, in either layout.
+        Folder of the data set, in either layout.
     key : str
         Name of the column.
     width : int

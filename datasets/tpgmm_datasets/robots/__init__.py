@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,12 @@ __all__ = ["bi_so101_urdf", "end_links", "parse_robot", "so101_urdf", "upper_bod
 BI_SO101 = "left=so101@0,0.2,0;right=so101@0,-0.2,0"
 #: How one of several robots is written.
 PART = "NAME=FILE@X,Y,Z (metres), perhaps with ,YAW (radians) or ,QW,QX,QY,QZ behind it"
+#: How hands are called that have no joint of a gripper.
+HAND = re.compile("(.*_)?(l|r|left|right)_hand")
 
 
 def upper_body_urdf() -> str:
-    """The URDF of a 17-joint upper body: three waist joints and two arms of seven.
+    """Read the URDF of a 17-joint upper body: three waist joints and two arms of seven.
 
     Joints, limits and masses are the published figures of the COMAN humanoid (the comment
     in the file names the source); the shapes are ours. The links of interest are ``l_hand``
@@ -38,7 +40,7 @@ def upper_body_urdf() -> str:
 
 
 def so101_urdf() -> str:
-    """The URDF of an SO-101 arm: five joints and a gripper.
+    """Read the URDF of an SO-101 arm: five joints and a gripper.
 
     Joints have the names of LeRobot's motors, and their figures are the published ones (the
     comment in the file names the source); shapes are not in it. The link of interest is
@@ -61,7 +63,7 @@ def so101_urdf() -> str:
 
 
 def bi_so101_urdf() -> str:
-    """The URDF of two SO-101 arms, named as LeRobot's ``bi_so_follower`` names its motors.
+    """Make the URDF of two SO-101 arms, named as LeRobot's ``bi_so_follower`` names its motors.
 
     The bases are 0.4 m apart in the frame ``world``: the left one at y = 0.2 m, the right one
     at y = -0.2 m. Where yours stand otherwise, :func:`parse_robot` puts them there.
@@ -79,7 +81,7 @@ ROBOTS = {"bi_so101": bi_so101_urdf, "so101": so101_urdf, "upper_body": upper_bo
 
 
 def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings: Any) -> Robot:
-    """The robot that a text stands for.
+    """Make the robot that a text stands for.
 
     Parameters
     ----------
@@ -105,27 +107,32 @@ def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings
     """
     texts = [text] if isinstance(text, str) else list(text)
     one = len(texts) == 1 and (texts[0].lstrip().startswith("<") or Path(texts[0]).is_file())
-    texts = texts if one else [part.strip() for each in texts for part in each.split(";")]
-    robots: dict[str, Any] = {}
-    places = {}
-    for part in [] if one or (len(texts) == 1 and "=" not in texts[0]) else texts:
-        match = re.fullmatch(r"(?!poses=|fixed=|base=)([A-Za-z]\w*)=(.+)@([^@]+)", part)
-        if match is None or match[1] in robots:
-            twice = "is there twice; one" if match else "is not"
-            raise DataError(f"robot {part!r} {twice} {PART}; got {texts}")
-        places[match[1]], robots[match[1]] = _place(part, match[3]), _robot(match[2])
-    model = (Robot.combine(places, **robots) if robots else _robot(texts[0])).model
+    parts = texts if one else [part.strip() for part in ";".join(texts).split(";")]
+    one |= len(parts) == 1 and "=" not in parts[0]
+    model = (_make_robot(parts[0]) if one else _combine_robots(parts)).model
     return Robot.from_urdf(model.text, links or end_links(model), **settings)
 
 
-def _robot(text: str) -> Robot:
+def _combine_robots(parts: Sequence[str]) -> Robot:
+    robots: dict[str, Any] = {}
+    places = {}
+    for part in parts:
+        match = re.fullmatch(r"(?!poses=|fixed=|base=)([A-Za-z]\w*)=(.+)@([^@]+)", part)
+        if match is None or match[1] in robots:
+            twice = "is there twice; one" if match else "is not"
+            raise DataError(f"robot {part!r} {twice} {PART}; got {list(parts)}")
+        places[match[1]], robots[match[1]] = _parse_place(part, match[3]), _make_robot(match[2])
+    return Robot.combine(places, **robots)
+
+
+def _make_robot(text: str) -> Robot:
     if "<" not in text and text not in ROBOTS and not Path(text).exists():
         raise DataError(f"there is no file {text!r}; robots of the package are {[*ROBOTS]}")
     return Robot.from_file(ROBOTS[text]() if text in ROBOTS else text, ())
 
 
-def _place(part: str, text: str) -> list[float]:
-    """Position and quaternion of a base."""
+def _parse_place(part: str, text: str) -> list[float]:
+    """Parse the position and quaternion of a base."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -139,7 +146,7 @@ def _place(part: str, text: str) -> list[float]:
 
 
 def end_links(model: UrdfModel) -> tuple[str, ...]:
-    """The links of interest that a description tells of; none where it does not.
+    """Find the links of interest that a description tells of; none where it does not.
 
     What carries a gripper's joints, known by their names, or the one link at the end of what is
     fixed to it; of the upper body that comes with the package, its hands.
@@ -147,25 +154,33 @@ def end_links(model: UrdfModel) -> tuple[str, ...]:
     Parameters
     ----------
     model : UrdfModel
-        Of a robot, ``robot.model``.
+        Description of a robot, ``robot.model``.
 
     Examples
     --------
     >>> end_links(parse_robot("so101").model)
     ('gripper_frame_link',)
     """
-    above = {joint.child: joint for joint in model.joints}
     carriers = {joint.parent for joint in model.movable.values() if is_gripper(joint.name)}
-    hand = re.compile("(.*_)?(l|r|left|right)_hand")
-    carriers |= {link for link in model.links if hand.fullmatch(link)}
-    parents, found = {joint.parent for joint in model.joints}, []
-    for carrier in (link for link in model.links if link in carriers):
-        link, fixed = carrier, [carrier]
-        while link in above and (link := above[link].parent) not in carriers:
-            pass
-        if link not in carriers - {carrier}:  # nothing above it carries a gripper
-            for link in fixed:  # which grows
-                fixed += [j.child for j in model.joints if j.parent == link and not j.movable]
-            tips = [link for link in fixed if link not in parents]
-            found.append(tips[0] if len(tips) == 1 else carrier)
-    return tuple(found)
+    carriers |= {link for link in model.links if HAND.fullmatch(link)}
+    parents = {joint.child: joint.parent for joint in model.joints}
+    highest = {link for link in carriers if not _is_below(link, carriers, parents)}
+    return tuple(_find_tip(link, model) for link in model.links if link in highest)
+
+
+def _is_below(link: str, wanted: Collection[str], parents: Mapping[str, str]) -> bool:
+    """Check if a link is below one of the wanted ones."""
+    while link in parents:
+        link = parents[link]
+        if link in wanted:
+            return True
+    return False
+
+
+def _find_tip(carrier: str, model: UrdfModel) -> str:
+    """Find the one link at the end of what is fixed to a link; else return that link."""
+    parents, fixed = {joint.parent for joint in model.joints}, [carrier]
+    for link in fixed:  # which grows
+        fixed += [j.child for j in model.joints if j.parent == link and not j.movable]
+    tips = [link for link in fixed if link not in parents]
+    return tips[0] if len(tips) == 1 else carrier

@@ -23,11 +23,11 @@ from tpgmm_datasets.bottle.skill import (
     GRASP_POINT,
     HANDS,
     BottleSkill,
-    attached,
+    approach_bottle,
     between,
     either,
+    place_hand,
     pose_error,
-    reached,
     upright,
 )
 from tpgmm_torch import Demonstration, Frame, Situation, quaternions
@@ -186,12 +186,12 @@ class CarryAndPut(BottleSkill):
             path = between(path, end, progress[phase])
         held, wanted = before_sliding(path, slides), []
         for hand in HANDS:
-            away = attached(held, APPROACH_POINT[hand])
-            leaving = between(attached(held, GRASP_POINT[hand]), away, progress["leave"])
-            pose = reached(first[hand], hand, bottles, progress)
+            away = place_hand(held, APPROACH_POINT[hand])
+            leaving = between(place_hand(held, GRASP_POINT[hand]), away, progress["leave"])
+            pose = approach_bottle(first[hand], hand, bottles, progress)
             wanted.append(either(progress["lift"] > 0, leaving, pose))
         joints = self._follow(starts, wanted)
-        return self._recorded(times, joints, ends, {"bottle": path, "tray": trays})
+        return self._record(times, joints, ends, {"bottle": path, "tray": trays})
 
     def _events(self, end: Mapping[str, float]) -> dict[str, float]:
         return {"grasp": end["hold"], "put": end["lower"], "rest": end["leave"]}

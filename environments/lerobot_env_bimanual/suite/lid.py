@@ -32,7 +32,7 @@ from lerobot_env_bimanual.suite.task import (
     seen,
     vector,
 )
-from tpgmm_datasets.bottle.skill import attached
+from tpgmm_datasets.bottle.skill import place_hand
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
@@ -125,19 +125,19 @@ class Lid(SuiteTask):
             """Where the right hand holds the lid, opened by a share of the angle."""
             plate = _turned(Frame(box.transform(hinge), box.orientation), opened * share)
             palm = _turned(Frame(plate.transform(point), plate.orientation), rolled)
-            return attached(palm, ORIGIN)
+            return place_hand(palm, ORIGIN)
 
         shut = lid(torch.zeros_like(opened))
         beside, above = (
-            Frame(attached(box, point).position + aside, orientation)
+            Frame(place_hand(box, point).position + aside, orientation)
             for point, aside, orientation in zip(
                 WAIT.values(),
                 style.aim.unbind(1),
-                (attached(box, SIDE).orientation, shut.orientation),
+                (place_hand(box, SIDE).orientation, shut.orientation),
                 strict=True,
             )
         )
-        close = Leg("close", attached(box, SIDE))
+        close = Leg("close", place_hand(box, SIDE))
         left = [Leg("reach", beside, free=True), close, Leg("away", beside)]
         right = [
             Leg("reach", above, free=True),

@@ -25,7 +25,7 @@ from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
-from tpgmm_datasets.bottle.skill import HANDS, attached, between, follow_hands
+from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands, place_hand
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -238,11 +238,11 @@ class SuiteTask(ABC):
 
     def at_grip(self, pose: Frame, hand: str) -> Frame:
         """Where a hand is that touches a thing with a pose."""
-        return attached(pose, self.grip[hand])
+        return place_hand(pose, self.grip[hand])
 
     def near(self, pose: Frame, hand: str, style: Style) -> Frame:
         """Where a hand waits beside a thing with a pose."""
-        return moved(attached(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
+        return moved(place_hand(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
 
     def start_posture(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Around the neutral one, shape (n_joints,) [rad]."""

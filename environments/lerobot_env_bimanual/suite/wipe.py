@@ -32,7 +32,7 @@ from lerobot_env_bimanual.suite.task import (
     seen,
     vector,
 )
-from tpgmm_datasets.bottle.skill import HANDS, attached
+from tpgmm_datasets.bottle.skill import HANDS, place_hand
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
@@ -192,7 +192,7 @@ def _turned(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
     for turn in turns:
         orientation = quaternions.product(orientation, quaternions.exp(vector(turn)))
     place = board.transform(point)
-    return attached(Frame(place, orientation.expand(*place.shape[:-1], 4)), (0.0, 0.0, 0.0))
+    return place_hand(Frame(place, orientation.expand(*place.shape[:-1], 4)), (0.0, 0.0, 0.0))
 
 
 class _Judge(Judge):

@@ -24,7 +24,7 @@ from tpgmm_datasets import check
 from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
-from tpgmm_datasets.lerobot.event_flags import stored_events
+from tpgmm_datasets.lerobot.stored_signals import stored_events
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.operators import Operator

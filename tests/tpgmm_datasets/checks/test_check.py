@@ -113,7 +113,7 @@ def test_joints_are_checked_in_the_order_of_the_robot():
 # -- time and events -------------------------------------------------------------------------
 
 
-def recorded(n=6, stretch=1.0, **events):
+def record(n=6, stretch=1.0, **events):
     return [
         Demonstration(
             TIME * stretch,
@@ -128,11 +128,11 @@ def recorded(n=6, stretch=1.0, **events):
     ("stretch", "odd"), [(0.5, False), (20, False), (1000, True), (50, True), (1e-6, True)]
 )
 def test_steps_of_time_tell_of_units(stretch, odd):
-    assert checks(recorded(stretch=stretch)) == [("time", ())] * odd
+    assert checks(record(stretch=stretch)) == [("time", ())] * odd
 
 
 def test_durations_of_a_factor_of_two_are_usual_and_of_five_are_not():
-    items = recorded()
+    items = record()
     for factor, odd in ((1.5, False), (5.0, True)):
         items[2] = replace(items[2], time=items[0].time * factor)
         assert checks(items) == [("durations", (2,))] * odd
@@ -140,7 +140,7 @@ def test_durations_of_a_factor_of_two_are_usual_and_of_five_are_not():
 
 
 def test_events_elsewhere_missing_or_in_another_order():
-    good = recorded(grasp=0.3, lift=0.4)
+    good = record(grasp=0.3, lift=0.4)
     assert checks(good) == []
     for wrong in ({"grasp": 1.6, "lift": 1.7}, {"grasp": 0.8, "lift": 0.6}, {"grasp": 0.6}):
         items = [*good[:5], replace(good[5], events=wrong)]

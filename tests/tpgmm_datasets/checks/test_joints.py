@@ -13,7 +13,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 TIME = np.arange(100) / 50
 
 
-def bounded(*limits, velocity=3.0):
+def limit_joints(*limits, velocity=3.0):
     """Joints alone, with these limits."""
     robot = JointSpace(tuple(f"j{i}" for i in range(len(limits))))
     robot.lower, robot.upper = torch.tensor(limits, dtype=torch.float64).T
@@ -29,12 +29,12 @@ def found(robot, *scales, names=None):
 
 
 def test_joints_within_their_limits_are_plausible():
-    assert found(bounded((-1, 1), (-0.1, 2)), 0.9, 1.5) == []
+    assert found(limit_joints((-1, 1), (-0.1, 2)), 0.9, 1.5) == []
     assert found(None, 0.9, 12.0) == []
 
 
 def test_speeds_beyond_the_robot_are_named_with_the_limit():
-    [finding] = found(bounded((-2, 2), velocity=0.5), 1.5)
+    [finding] = found(limit_joints((-2, 2), velocity=0.5), 1.5)
     assert finding.check == "speed" and finding.episodes == (0, 1, 2, 3)
 
 

@@ -69,7 +69,7 @@ def test_what_is_held_is_found_in_measured_joints(tmp_path):
     assert (other.begin, other.end) == pytest.approx((hold.begin, hold.end), abs=0.06)
 
 
-def renamed(root, name):
+def rename_state(root, name):
     """The measured joints under another name."""
     change_table(
         root,
@@ -85,7 +85,7 @@ def renamed(root, name):
 
 @pytest.mark.parametrize("name", ["observation.states.joint.position", "measured", "arm.qpos"])
 def test_commands_in_place_of_an_unusual_state_are_told_once(root, name):
-    renamed(root, name)
+    rename_state(root, name)
     with pytest.warns(PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'") as told:
         commands = joints_of(load_lerobot(root))
     assert len(told) == 1

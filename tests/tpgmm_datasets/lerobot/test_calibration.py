@@ -39,7 +39,7 @@ def arm(root):
 
 
 def read_by_lerobot(ticks, mode):
-    """What LeRobot stores of ticks, by its own motor bus."""
+    """Normalise ticks as LeRobot stores them, by its own motor bus."""
     bus = FeetechMotorsBus.__new__(FeetechMotorsBus)  # without a port
     motors = {
         name: Motor(i, "sts3215", MotorNormMode.RANGE_0_100 if name == "gripper" else mode)
@@ -83,8 +83,8 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         calibration={"left_": file, "right_": str(file)},
         units={"right_gripper.pos": "raw"},
     )
-    scales = [Scale.calibrated(*ends) for ends in RANGES.values()][:2]
-    scales.append(Scale.calibrated(*RANGES["gripper"], stored=(0, 100)))
+    scales = [Scale.from_calibration(*ends) for ends in RANGES.values()][:2]
+    scales.append(Scale.from_calibration(*RANGES["gripper"], stored=(0, 100)))
     scales = [*scales, *scales[:2], Scale(1.0)]
     expected = rows[:12] * [s.factor for s in scales] + [s.offset for s in scales]
     np.testing.assert_allclose(first.joints.numpy(), expected, rtol=0, atol=1e-12)
@@ -104,7 +104,7 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         ),
         (
             {"wrist_roll": motor(1, (0, 9), drive_mode=1)},
-            r"'wrist_roll' has the drive mode 1.*Scale\.calibrated\(0, 9",
+            r"'wrist_roll' has the drive mode 1.*Scale\.from_calibration\(0, 9",
         ),
     ],
 )
@@ -114,17 +114,15 @@ def test_what_is_no_calibration_of_the_set_is_refused(arm, file, content, messag
         load_lerobot(arm, joints="arm", calibration=file)
 
 
-@pytest.mark.parametrize("calibration", [3, {"left_": None}])
-def test_a_calibration_is_a_file_or_several_by_prefix(arm, calibration):
-    with pytest.raises(DatasetError, match="several by prefix; got"):
-        load_lerobot(arm, joints="arm", calibration=calibration)
-
-
 def test_values_in_degrees_and_units_for_all_are_refused(arm, file):
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda values: 1.2 * values))
     with pytest.raises(DatasetError, match=r"goes from -120 to .*use_degrees.*units='deg'"):
         load_lerobot(arm, joints="arm", calibration=file)
-    with pytest.raises(DatasetError, match="give one of them"):
-        load_lerobot(arm, joints="arm", calibration=file, units="deg")
-    with pytest.raises(DatasetError, match=r"cannot be read: .*leg\.json"):
-        load_lerobot(arm, joints="arm", calibration=file.with_name("leg.json"))
+    for options, told in (
+        ({"calibration": file, "units": "deg"}, "give one of them"),
+        ({"calibration": file.with_name("leg.json")}, r"cannot be read: .*leg\.json"),
+        ({"calibration": 3}, "several by prefix; got"),
+        ({"calibration": {"left_": None}}, "several by prefix; got"),
+    ):
+        with pytest.raises(DatasetError, match=told):
+            load_lerobot(arm, joints="arm", **options)

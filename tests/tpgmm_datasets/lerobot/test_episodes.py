@@ -58,13 +58,13 @@ def test_numbers_that_are_more_precise_than_declared_are_read(root, tmp_path):
     change_info(plain, lambda i: i["features"][STATE].update(dtype="float32"))
     assert_equal(joints_of(load_lerobot(plain)), expected)
 
-    def rounded(table):
+    def round_state(table):
         values = table[STATE].combine_chunks().cast(pa.list_(pa.float32(), 3))
         return set_column(table, STATE, values)
 
     change_info(plain, lambda i: i["features"][STATE].update(dtype="float64"))
     for file in sorted((plain / "data").rglob("*.parquet")):
-        change_table(plain, file.relative_to(plain), rounded)
+        change_table(plain, file.relative_to(plain), round_state)
     with pytest.raises(DatasetError, match=r"it holds float, info\.json declares float64"):
         load_lerobot(plain)
 
@@ -112,6 +112,9 @@ def test_a_relaxed_check_leaves_the_episode_out_and_says_so(root, check):
         ("nan", in_data(STATE, spoil(14, 1, np.inf)), (DATA, 1, STATE)),
         ("nan", in_data(POSE, spoil(14, 1, np.nan)), (DATA, 1, POSE)),
         ("nan", nulls, (DATA, 1, STATE)),
+        ("nan", in_data("timestamp", spoil(14, 0, np.nan)), (DATA, 1, "timestamp")),
+        ("time", in_data("timestamp", stuck), (DATA, 1, "timestamp")),
+        ("gaps", in_data("timestamp", later), (DATA, 1, "timestamp")),
         ("metadata", in_data("frame_index", spoil(14, 0, 7)), (DATA, 1, "frame_index")),
         ("metadata", in_data("index", spoil(14, 0, 7)), (DATA, 1, "index")),
         ("metadata", lambda r: change_table(r, DATA, lambda t: t.slice(0, 35)), (DATA, 2)),

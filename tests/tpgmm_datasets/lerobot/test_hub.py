@@ -17,26 +17,19 @@ def test_an_id_is_looked_up_in_the_cache_of_lerobot(root, tmp_path, monkeypatch)
     assert len(load_lerobot("someone/bottles")) == 3
 
 
-def test_an_id_is_fetched_without_videos(root, tmp_path, monkeypatch):
+def test_an_id_is_fetched_without_videos_or_the_error_says_how_to_get_it(root, monkeypatch):
     asked = {}
 
     def fetch(repo_id, **options):
+        if asked:
+            raise OSError("offline")
         asked.update(options, repo_id=repo_id)
         return str(root)
 
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
     assert len(load_lerobot("hf://datasets/someone/bottles")) == 3
     assert asked["repo_id"] == "someone/bottles"
     assert not any("videos" in pattern for pattern in asked["allow_patterns"])
-
-
-def test_an_id_out_of_reach_says_how_to_get_it(tmp_path, monkeypatch):
-    def fetch(repo_id, **options):
-        raise OSError("offline")
-
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
-    monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
     with pytest.raises(DatasetError, match="hf download --repo-type dataset someone/bottles"):
         load_lerobot("hf://datasets/someone/bottles")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.support.lerobot_sets import DATA, FPS, assert_refused, in_data, later, spoil, stuck
+from tests.support.lerobot_sets import FPS
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
@@ -11,14 +11,6 @@ from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 def test_time_is_the_grid_of_the_rate(root):
     for demonstration in load_lerobot(root):
         assert demonstration.time.tolist() == [k / FPS for k in range(len(demonstration))]
-
-
-@pytest.mark.parametrize(
-    ("check", "change"), [("nan", spoil(14, 0, np.nan)), ("time", stuck), ("gaps", later)]
-)
-def test_time_that_is_wrong_is_refused_and_located(root, check, change):
-    in_data("timestamp", change)(root)
-    assert_refused(root, check, DATA, 1, "timestamp")
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ class DataOptions:
         """Open a ``dataset``, with a robot without limits for what is in a unit of its own."""
         from tpgmm_datasets.reader import open_recording
 
-        return open_recording(dataset, **(self.arguments(robot) | options)).unlimited()
+        return open_recording(dataset, **(self.arguments(robot) | options)).drop_raw_limits()
 
     def read(self, dataset: str, robot: Kinematics | None = None) -> list[Demonstration]:
         """Read the demonstrations in a ``dataset``, joints in the order of a ``robot``."""

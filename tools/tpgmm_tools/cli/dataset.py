@@ -40,7 +40,7 @@ def info(
         A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import summed_up
+    from tpgmm_datasets.errors import list_problems
     from tpgmm_torch.checks.report import in_columns
 
     description = describe_lerobot(path)
@@ -49,7 +49,7 @@ def info(
     head = ("column", "type", "value", "unit", "from", "to")
     rows = [row for column in description.columns for row in _rows(column)]
     typer.echo(f"\n{in_columns([head, *rows])}")
-    for problem in summed_up(description.problems):
+    for problem in list_problems(description.problems):
         typer.echo(f"problem: {problem}")
 
 
@@ -74,11 +74,11 @@ def check(
         Fail for what is only unlikely, too.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import CHECKS, summed_up
+    from tpgmm_datasets.errors import CHECKS, list_problems
 
     description = describe_lerobot(path)
     problems = [problem for problem in description.problems if problem.check != "joints"]
-    for problem in summed_up(problems):
+    for problem in list_problems(problems):
         typer.echo(problem)
     if problems:
         raise typer.Exit(1)

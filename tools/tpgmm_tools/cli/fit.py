@@ -286,7 +286,7 @@ def _sum_up_recording(
 ) -> dict[str, str]:
     """Sum up the data set and the robot, before anything is learned."""
     from tpgmm_datasets.lerobot.columns import EVENT
-    from tpgmm_datasets.lerobot.event_flags import event_features
+    from tpgmm_datasets.lerobot.stored_signals import event_features
 
     assembly, joints = recording.assembly, recording.assembly.joints
     robot = assembly.robot

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
-from tpgmm_datasets.errors import DatasetError, summed_up
+from tpgmm_datasets.errors import DatasetError, list_problems
 from tpgmm_datasets.lerobot import columns as kept
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
@@ -97,7 +97,7 @@ def track_lerobot(
         episodes = sorted({one.episode for one in problems if one.episode is not None})
         raise DatasetError(
             f"objects cannot be followed in episodes {episodes}: "
-            f"{'; '.join(summed_up(problems))}. Nothing was written. Record them again, or "
+            f"{'; '.join(list_problems(problems))}. Nothing was written. Record them again, or "
             f"leave them out: lerobot-edit-dataset --repo_id {folder.name} --root {folder} "
             "--new_root NEW --operation.type delete_episodes "
             f"--operation.episode_indices '{episodes}'"

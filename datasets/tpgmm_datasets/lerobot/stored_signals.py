@@ -1,4 +1,7 @@
-"""Events that a data set keeps: columns ``event.<name>``, true at the step of the event."""
+"""Events and wrenches that a data set keeps, in columns of their own.
+
+``event.<name>`` is true at the step of the event, ``observation.wrench.<link>`` has six values.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +9,24 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.layout import Feature, Layout, open_layout
 
-__all__ = ["event_features", "flagged_events", "stored_events"]
+__all__ = ["event_features", "stored_events"]
 
 
 def event_features(layout: Layout) -> list[Feature]:
-    """The columns of a data set that tell of events."""
+    """List the columns of a data set that tell of events."""
     features = layout.features.values()
     return [f for f in features if f.key.startswith(EVENT) and f.dtype == "bool"]
 
 
 def flagged_events(rows: EpisodeRows) -> dict[str, float]:
-    """When each event of an episode is, from its start [s]; the first step that is true.
+    """Read when each event of an episode is, from its start [s]; the first step that is true.
 
     Parameters
     ----------
@@ -36,12 +41,14 @@ def flagged_events(rows: EpisodeRows) -> dict[str, float]:
 
 
 def stored_events(root: Path, episodes: Collection[int]) -> dict[int, dict[str, float]]:
-    """The events of some episodes of the data set in a folder, by their index.
+    """Read the events of some episodes of the data set in a folder, by their index.
 
     Parameters
     ----------
     root : Path
+        The folder.
     episodes : collection of int
+        Indices of the episodes.
 
     Raises
     ------
@@ -52,3 +59,24 @@ def stored_events(root: Path, episodes: Collection[int]) -> dict[int, dict[str, 
     wanted = [episode for episode in layout.episodes if episode.index in episodes]
     rows = read_episodes(layout, wanted, event_features(layout), Relaxed(()))
     return {one.episode.index: flagged_events(one) for one in rows}
+
+
+def wrench_features(layout: Layout) -> list[Feature]:
+    """List the columns of a data set that hold wrenches of links."""
+    features = layout.features.values()
+    return [f for f in features if f.key.startswith(WRENCH) and f.width == 6]
+
+
+def stored_wrenches(rows: EpisodeRows) -> dict[str, Tensor]:
+    """Read wrenches (T, 6) of an episode by link: forces [N], then moments [N m].
+
+    Parameters
+    ----------
+    rows : EpisodeRows
+        Read with :func:`wrench_features`.
+    """
+    return {
+        key.removeprefix(WRENCH): torch.from_numpy(values.astype(np.float64))
+        for key, values in rows.values.items()
+        if key.startswith(WRENCH)
+    }
