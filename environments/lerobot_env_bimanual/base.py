@@ -59,7 +59,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         raise NotImplementedError
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """A picture, at most 25 new ones per simulated second.
+        """Draw a picture, at most 25 new ones per simulated second.
 
         Returns
         -------
@@ -84,7 +84,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
 
 
 def finite_vector(name: str, values: ArrayLike, length: int) -> NDArray[np.float64]:
-    """A copy of ``length`` finite values."""
+    """Copy ``length`` values, which have to be finite."""
     vector = np.array(values, dtype=np.float64)
     if vector.shape != (length,):
         raise ShapeError(f"{name} needs {length} values, shape ({length},), got {vector.shape}")

@@ -17,7 +17,7 @@ from lerobot_env_bimanual.disturbances import (
     NOMINAL,
     Course,
     Disturbance,
-    displaced,
+    displace_pose,
     generators,
     parse_condition,
 )
@@ -215,11 +215,11 @@ class ControlledEnv(StateEnv):
 
     @abstractmethod
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
 
     @abstractmethod
     def _successful(self, figures: Mapping[str, float]) -> bool:
-        """Whether the figures at the end are those of a success."""
+        """Check whether the figures at the end are those of a success."""
 
     @abstractmethod
     def _begin(self, options: Mapping[str, Any]) -> Start:
@@ -231,7 +231,7 @@ class ControlledEnv(StateEnv):
 
     @abstractmethod
     def _usual(self, step: NDArray[np.float64]) -> bool:
-        """Whether the task is meant for a first object that is displaced so at the start."""
+        """Check whether the task is meant for a first object displaced so at the start."""
 
     @abstractmethod
     def _displace(self, step: NDArray[np.float64]) -> None:
@@ -242,7 +242,7 @@ class ControlledEnv(StateEnv):
         raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
     def _instant(self) -> float:
-        """Where on the nominal path the robot is [s]."""
+        """Return the instant of the nominal path at which the robot is [s]."""
         raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
     def reset(
@@ -276,7 +276,7 @@ class ControlledEnv(StateEnv):
         self._grain = np.random.default_rng(zlib.crc32(start.joints.tobytes()))
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Any]] = []
-        self._shown = self._seen = self._perceived(start.misperception.reshape(-1, 6))
+        self._shown = self._seen = self._perceive_objects(start.misperception.reshape(-1, 6))
         for part in self._drawn:
             if part.start():
                 self._put_on_path(part.start())
@@ -307,9 +307,9 @@ class ControlledEnv(StateEnv):
         DataError
             If it is not finite, no episode is going on, or the simulation diverges.
         """
-        wanted = self._checked(action)
+        wanted = self._read_action(action)
         stopped = any(part.stops(self._time) for part in self._drawn)
-        goal = self._reference if stopped else self._limited(wanted)
+        goal = self._reference if stopped else self._limit_reference(wanted)
         clipped = float(np.abs(wanted - goal).max())
         seconds = self._move(goal)
         # in whole milliseconds, so that no sum is rounded
@@ -328,7 +328,7 @@ class ControlledEnv(StateEnv):
             info["is_success"] = self._successful(info)
         return self._observation(), float(info["is_success"]), False, over, info
 
-    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
+    def _read_action(self, action: ArrayLike) -> NDArray[np.float64]:
         if self._steps >= self.episode_length:
             raise DataError("no episode is going on: call reset first")
         wanted = np.asarray(action, dtype=np.float64)
@@ -343,8 +343,8 @@ class ControlledEnv(StateEnv):
             raise DataError(f"the action is not finite for {names} at step {self._steps}")
         return wanted
 
-    def _limited(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A reference within the joints' ranges, and in reach at their speed."""
+    def _limit_reference(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Limit a reference to the joints' ranges, and to what they reach at their speed."""
         last = self._reference
         allowed = np.minimum(np.maximum(wanted, self._lower), self._upper)
         return last + np.minimum(np.maximum(allowed - last, -self._stride), self._stride)
@@ -367,7 +367,7 @@ class ControlledEnv(StateEnv):
         return n / 1000
 
     def _record(self, seconds: float, stopped: bool) -> None:
-        """How hard the robot moves; while it is stopped it is not judged."""
+        """Record how hard the robot moves; while it is stopped it is not judged."""
         joints = self._scene.joints
         velocity = (joints - self._joints) / seconds
         if not stopped:
@@ -388,9 +388,9 @@ class ControlledEnv(StateEnv):
             elif seconds > 0:
                 self._put_on_path(self._instant() + seconds)
         if self._returns:
-            self._past.append((self._time, self._remembered()))
+            self._past.append((self._time, self._take_snapshot()))
 
-    def _remembered(self) -> Any:
+    def _take_snapshot(self) -> Any:
         """State that :meth:`_restore` needs."""
         return self._scene.snapshot()
 
@@ -419,7 +419,9 @@ class ControlledEnv(StateEnv):
             joints += self.noise * NOISE_JOINTS * draw(len(joints))
         if self._live:
             n = len(self._scene.objects)
-            self._seen = self._perceived(draw((n, 6)) if self.noise else np.zeros((n, 6)))
+            self._seen = self._perceive_objects(
+                draw((n, 6)) if self.noise else np.zeros((n, 6))
+            )
         shown = self._seen
         for part, rng in zip(self._drawn, self._rngs, strict=True):
             shown = part.seen(shown, self._shown, self._time, rng)
@@ -431,12 +433,12 @@ class ControlledEnv(StateEnv):
             seen["pixels"] = self.eyes.pictures(self._grain)
         return seen
 
-    def _perceived(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The objects' poses with errors given in standard deviations (n_objects, 6)."""
+    def _perceive_objects(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Observe the objects' poses with errors in standard deviations (n_objects, 6)."""
         poses = self._scene.objects
         if self.noise:
             poses = [
-                np.clip(displaced(pose, self.noise * NOISE_POSE * error), -RANGE, RANGE)
+                np.clip(displace_pose(pose, self.noise * NOISE_POSE * error), -RANGE, RANGE)
                 for pose, error in zip(poses, errors, strict=True)
             ]
         return np.concatenate(poses)

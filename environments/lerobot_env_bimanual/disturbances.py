@@ -23,7 +23,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 __all__ = [
     "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
     "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "Spoilt",
-    "StartedMidway", "Stopped", "displaced", "generators", "parse_condition",
+    "StartedMidway", "Stopped", "displace_pose", "generators", "parse_condition",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -79,7 +79,7 @@ class Disturbance:
     def drawn(
         self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
     ) -> Self:
-        """The disturbance with everything that is random about it.
+        """Draw everything that is random about the disturbance.
 
         Parameters
         ----------
@@ -94,11 +94,11 @@ class Disturbance:
         return dataclasses.replace(self, **{"moment": moment if math.isnan(given) else given})
 
     def stops(self, time: float) -> bool:
-        """Whether the robot is stopped."""
+        """Check whether the robot is stopped."""
         return False
 
     def period(self, rng: np.random.Generator) -> float:
-        """The time to the next tick, in multiples of what it should be."""
+        """Return the time to the next tick, in multiples of what it should be."""
         return 1.0
 
     def seen(
@@ -114,18 +114,18 @@ class Disturbance:
         return poses
 
     def displacement(self, time: float) -> Vector | None:
-        """How far somebody has moved the first object, shape (6,): [m], then [rad].
+        """Return how far somebody has moved the first object, shape (6,): [m], then [rad].
 
         None where nobody touches it.
         """
         return None
 
     def shove(self, begin: float, end: float) -> float:
-        """The seconds of the task by which the robot is displaced between two times."""
+        """Return the seconds of the task by which the robot is displaced between two times."""
         return 0.0
 
     def start(self) -> float:
-        """Where in the task the episode begins [s]."""
+        """Return the instant of the task at which the episode begins [s]."""
         return 0.0
 
     def sag(self, n_joints: int) -> Vector:
@@ -306,7 +306,7 @@ class NoisyPose(Disturbance):
         noisy = poses.copy()
         spread = np.repeat((self.distance, self.angle), 3)
         for pose in noisy.reshape(-1, POSE):
-            pose[:] = displaced(pose, spread * rng.standard_normal(6))
+            pose[:] = displace_pose(pose, spread * rng.standard_normal(6))
         return noisy
 
 
@@ -351,7 +351,7 @@ class Biased(_Lasting):
             axes = own.standard_normal((2, 3))
             axes /= np.linalg.norm(axes, axis=1, keepdims=True)
             error = (self.distance * axes[0], self.angle * axes[1])
-            pose[:] = displaced(pose, np.concatenate(error))
+            pose[:] = displace_pose(pose, np.concatenate(error))
         return biased
 
 
@@ -373,7 +373,7 @@ class Misplaced(_Lasting):
     def seen(
         self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
     ) -> Vector:
-        """Where it is not."""
+        """Observe it above or below its place, or tilted."""
         thought, way = poses.copy(), np.random.default_rng(self.seed).uniform(0, 2 * math.pi)
         tilt = self.angle * np.array((math.cos(way), math.sin(way), 0.0))
         for pose in thought.reshape(-1, POSE):
@@ -381,7 +381,7 @@ class Misplaced(_Lasting):
             upwards = np.array(
                 (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
             )
-            pose[:] = displaced(pose, np.concatenate((-self.height * upwards, tilt)))
+            pose[:] = displace_pose(pose, np.concatenate((-self.height * upwards, tilt)))
         return thought
 
 
@@ -536,7 +536,7 @@ CONDITIONS = (
 
 
 def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance, ...]:
-    """The disturbances that a text names, always in the same order.
+    """Parse the disturbances that a text names, always in the same order.
 
     Parameters
     ----------
@@ -564,16 +564,22 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         return tuple(condition)
     found: dict[str, Disturbance] = {}
     for text in () if condition == NOMINAL else condition.split("+"):
-        match = re.fullmatch(rf"([a-z]+(?:-[a-z]+)*)(?:-{_NUMBER})?(?:@{_NUMBER})?", text)
-        kind, *numbers = match.groups() if match else (text,)
-        if kind not in _KINDS:
-            where = "the conditions of the environment"
-            raise UnknownNameError("disturbance", text, where, (NOMINAL, *_KINDS))
+        kind, numbers = _split(text)
         if kind in found:
             raise DataError(f"{condition!r} names {kind} twice")
-        given = zip(("seconds", "moment"), numbers, strict=True)
-        found[kind] = _with(kind, {name: float(text) for name, text in given if text})
+        found[kind] = _with(kind, numbers)
     return tuple(found[kind] for kind in _KINDS if kind in found)
+
+
+def _split(text: str) -> tuple[str, dict[str, float]]:
+    """Split the text of one disturbance into its kind and the numbers behind it."""
+    match = re.fullmatch(rf"([a-z]+(?:-[a-z]+)*)(?:-{_NUMBER})?(?:@{_NUMBER})?", text)
+    kind, *numbers = match.groups() if match else (text,)
+    if kind not in _KINDS:
+        where = "the conditions of the environment"
+        raise UnknownNameError("disturbance", text, where, (NOMINAL, *_KINDS))
+    given = zip(("seconds", "moment"), numbers, strict=True)
+    return kind, {name: float(number) for name, number in given if number}
 
 
 def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
@@ -603,8 +609,8 @@ def generators(
     return [np.random.default_rng((key, zlib.crc32(name.encode()))) for name in names]
 
 
-def displaced(pose: Vector, error: Vector) -> Vector:
-    """A pose (7,) that is off by ``error`` (6,).
+def displace_pose(pose: Vector, error: Vector) -> Vector:
+    """Displace a pose (7,) by ``error`` (6,).
 
     The error is a displacement [m] and, about the axes of the pose, a rotation vector [rad].
     """

@@ -102,7 +102,7 @@ class Start:
         return replace(self, joints=joints, poses=chosen, slide=slide)
 
     def torques(self, start: int, steps: int) -> NDArray[np.float64]:
-        """The push, as torques (steps, n_joints) [N m], one for each millisecond."""
+        """Return the push as torques (steps, n_joints) [N m], one for each millisecond."""
         torques = np.zeros((steps, len(self.joints)))
         first = round(1000 * self.push_start) - start
         last = first + round(1000 * self.push_length)

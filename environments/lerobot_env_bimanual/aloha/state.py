@@ -221,7 +221,7 @@ class AlohaStateEnv(StateEnv):
         return poses
 
     def _height(self) -> float:
-        """Of the cube or the peg [m]."""
+        """Return the height of the cube or the peg [m]."""
         return float(self._rules.get_env_state(self._physics)[2])
 
     def _observation(self) -> Observation:

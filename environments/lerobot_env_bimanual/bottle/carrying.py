@@ -39,7 +39,7 @@ PATH_RATE = 25.0
 
 @functools.cache
 def carrying() -> CarryAndPut:
-    """The generator, on the robot of the other tasks."""
+    """Make the generator, on the robot of the other tasks."""
     return CarryAndPut(robot=skill().robot)
 
 
@@ -88,7 +88,7 @@ class CarryAndPutEnv(BottleEnv):
         super().__init__(TrayScene(), DURATION, COURSE, track=True, **options)
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
         bottle, tray = (torch.from_numpy(pose) for pose in self._scene.objects)
         distance, angle = carrying().put_error(
             Frame(bottle[:3], bottle[3:]), Frame(tray[:3], tray[3:])
@@ -103,7 +103,7 @@ class CarryAndPutEnv(BottleEnv):
         }
 
     def _leaning(self) -> float:
-        """Of the bottle, from the vertical [deg]."""
+        """Return the bottle's angle with the vertical [deg]."""
         x, y = self._scene.bottle[4:6]
         return math.degrees(2 * math.asin(min(1.0, math.hypot(x, y))))
 

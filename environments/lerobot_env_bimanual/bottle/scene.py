@@ -190,7 +190,7 @@ class BottleScene(RobotScene):
         data.qpos[:n] = joints
         mujoco.mj_kinematics(self.model, data)
         if self.held:
-            (left, turn), (right, other) = (self._carried(e) for e in range(2))
+            (left, turn), (right, other) = (self._pose_in_hand(e) for e in range(2))
             data.qpos[n : n + 3] = (left + right) / 2
             data.qpos[n + 3 :] = turn + math.copysign(1, turn @ other) * other
             mujoco.mj_normalizeQuat(self.model, data.qpos)
@@ -207,7 +207,7 @@ class BottleScene(RobotScene):
         mujoco.mj_kinematics(self.model, data)
 
     def snapshot(self) -> Snapshot:
-        """The state without velocities."""
+        """Return the state without velocities."""
         return Snapshot(self.data.qpos.copy(), self.held, self.table)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -240,17 +240,17 @@ class BottleScene(RobotScene):
         self.data.eq_active[:] = False
 
     def pull(self) -> float:
-        """The larger force between the bottle and a hand that holds it [N]."""
+        """Return the larger force between the bottle and a hand that holds it [N]."""
         # rows of equality constraints come first, six per weld: force, then moment
         left, _, right, _ = self.data.efc_force[:12].reshape(4, 3)
         return math.sqrt(max(left @ left, right @ right))
 
     def slip(self) -> float:
-        """How far the hands are from where they took hold of the bottle [m]."""
-        left, right = (self._carried(weld)[0] for weld in range(2))
+        """Measure how far the hands are from where they took hold of the bottle [m]."""
+        left, right = (self._pose_in_hand(weld)[0] for weld in range(2))
         return float(np.linalg.norm(left - right) / 2)
 
-    def _carried(self, weld: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _pose_in_hand(self, weld: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Position and orientation of the bottle, were it rigidly attached to one hand."""
         point, relative = self.model.eq_data[weld, :3], self.model.eq_data[weld, 6:10]
         hand, turn, moved = self._hands[weld], np.empty(4), np.empty(3)

@@ -103,7 +103,7 @@ class BottleShakingEnv(BottleEnv):
                 raise DataError(f"{name} is finite and above 0, got {getattr(self, name)!r}")
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
         distance, angle = self.grasp()
         motion = self._since_grasp()
         shaking = find_shaking(motion[:, self._pitches], self.fps, self.frequency)

@@ -82,7 +82,7 @@ class TorqueScene(BottleScene):
 
     @property
     def velocities(self) -> NDArray[np.float64]:
-        """Of the joints, shape (17,) [rad/s]."""
+        """Velocities of the joints, shape (17,) [rad/s]."""
         return self.data.qvel[: self._n].copy()
 
     def dynamics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -130,7 +130,7 @@ class TorqueScene(BottleScene):
             self.model.geom_pos[self._obstacle] = AWAY
 
     def touched_for(self) -> float:
-        """How long ago the obstacle was first touched [s]; minus infinity before."""
+        """Return the time since the obstacle was first touched [s]; minus infinity before."""
         return float(self.data.time) - self._touched
 
     def _controls(
@@ -228,29 +228,29 @@ class BottleTorqueEnv(BottleShakingEnv):
             first = int(np.searchsorted(path.time.numpy(), rng.uniform(*INSTANT)))
             way = skill().robot.state(path.joints[first:]).position(hand).numpy()
             next(place for place in way if self._scene.block(place) > CLEARANCE)
-        return observation, {**info, **self._measured()}
+        return observation, {**info, **self._measurements()}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move for one period of the control; see :meth:`BottleShakingEnv.step`."""
         observation, reward, terminated, truncated, info = super().step(action)
         if self._scene.touched_for() > self.obstacle:
             self._scene.clear()
-        return observation, reward, terminated, truncated, {**info, **self._measured()}
+        return observation, reward, terminated, truncated, {**info, **self._measurements()}
 
     def dynamics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See :meth:`TorqueScene.dynamics`."""
         return self._scene.dynamics()
 
-    def _measured(self) -> dict[str, Any]:
+    def _measurements(self) -> dict[str, Any]:
         return {"velocity": self._scene.velocities, "peak_contact_N": self._scene.force}
 
-    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
-        """The references; gains or torques go to the scene."""
+    def _read_action(self, action: ArrayLike) -> NDArray[np.float64]:
+        """Check the references, and give gains or torques to the scene."""
         if self.control == "reference":
-            return super()._checked(action)
+            return super()._read_action(action)
         scene, values = self._scene, np.asarray(action, dtype=np.float64)
         if self.control == "torque":
-            scene.torques = super()._checked(values)
+            scene.torques = super()._read_action(values)
             return np.clip(scene.joints, self._lower, self._upper)
         n = len(self.joint_names)
         if values.shape != (3 * n,):
@@ -259,7 +259,7 @@ class BottleTorqueEnv(BottleShakingEnv):
                 f"damping of {n} joints, shape ({3 * n},): {list(self.joint_names)}"
             )
         wanted, *gains = (
-            super(BottleTorqueEnv, self)._checked(v) for v in values.reshape(3, n)
+            super(BottleTorqueEnv, self)._read_action(v) for v in values.reshape(3, n)
         )
         if min(map(np.min, gains)) < 0:
             raise DataError(f"stiffness and damping are not below 0, got {values[n:].tolist()}")

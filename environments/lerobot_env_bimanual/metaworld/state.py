@@ -118,7 +118,7 @@ class MetaworldStateEnv(StateEnv):
 
     @property
     def target(self) -> NDArray[np.float64]:
-        """Where the target of the hand is now [m], (3,)."""
+        """Present place of the hand's target [m], (3,)."""
         return np.array(self._env.data.mocap_pos[0])
 
     @property
@@ -175,7 +175,7 @@ class MetaworldStateEnv(StateEnv):
 
 
 def metaworld_library() -> Any:
-    """The package ``metaworld``.
+    """Import the package ``metaworld``.
 
     Raises
     ------

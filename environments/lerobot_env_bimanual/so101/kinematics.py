@@ -49,7 +49,7 @@ class Reach:
     def __call__(
         self, joints: ArrayLike, target: ArrayLike, point: ArrayLike, up: ArrayLike
     ) -> NDArray[np.float64]:
-        """The posture, near another one, in which a point of the hand is at a target.
+        """Find the posture, near another one, in which a point of the hand is at a target.
 
         Parameters
         ----------

@@ -31,7 +31,7 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    raised,
+    raise_pose,
     seen,
     vector,
 )
@@ -100,7 +100,7 @@ class Pour(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A cup and a jug, which collide with the table alone."""
+        """Add a cup and a jug, which collide with the table alone."""
         shapes = {
             "cup": (CUP, CUP_HALF, 0.15, (0.3, 0.5, 0.85, 1)),
             "jug": (JUG, JUG_HALF, 0.3, (0.9, 0.75, 0.3, 1)),
@@ -110,7 +110,7 @@ class Pour(SuiteTask):
             add_geom(body, CYLINDER, (radius, half, 0), mass=mass, conaffinity=TABLE, **look)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The cup on the right, the jug on the left of the table."""
+        """Draw the cup on the right, the jug on the left of the table."""
         cup = BOX.draw(rng)
         return {"cup": cup, "jug": BOX.across(cup[2] - CUP_HALF + JUG_HALF).draw(rng)}
 
@@ -138,7 +138,7 @@ class Pour(SuiteTask):
         left = [
             Leg("reach", self.near(jug, "l_hand", style), free=True),
             Leg("lift", self.at_grip(jug, "l_hand")),
-            Leg("raise", self.at_grip(raised(jug, LIFT), "l_hand")),
+            Leg("raise", self.at_grip(raise_pose(jug, LIFT), "l_hand")),
             Leg("bring", self.at_grip(ready, "l_hand"), free=True),
             pouring("tilt", minimum_jerk),
             pouring("pour", torch.ones_like),
@@ -174,7 +174,7 @@ def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:
 
 
 def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:
-    """The jug (n,), tilted so far, its mouth where it should then be for a cup.
+    """Return the jug (n,), tilted so far, its mouth where it should then be for a cup.
 
     While it is upright that is beside the cup, and it goes above it as it is tilted.
     """
@@ -256,6 +256,6 @@ def _seen(scene: SuiteScene, places: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _lean(scene: SuiteScene, name: str) -> float:
-    """Of an object's axis from the vertical [deg]."""
+    """Return the angle of an object's axis with the vertical [deg]."""
     cosine = float(scene.data.body(name).xmat[8])
     return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

@@ -103,7 +103,7 @@ class SuiteScene(RobotScene):
         return float(self.model.body_pos[self.model.body("table").id, 2])
 
     def pose(self, name: str) -> NDArray[np.float64]:
-        """A body's position [m] and orientation, a unit quaternion; shape (7,)."""
+        """Return a body's position [m] and orientation, a unit quaternion; shape (7,)."""
         body = self.data.body(name)
         return np.concatenate((body.xpos, body.xquat))
 
@@ -155,7 +155,7 @@ class SuiteScene(RobotScene):
         return float(mujoco.mj_geomDistance(model, self.data, palm, grip, 1.0, points))
 
     def depth(self, body: str) -> float:
-        """How deep whatever moves is in a body that stands still, 0 if nowhere [m].
+        """Measure how deep whatever moves is in a body that stands still, 0 if nowhere [m].
 
         It is right with MuJoCo 3.12 or newer.
         """
@@ -180,7 +180,7 @@ class SuiteScene(RobotScene):
         self.held.discard(hold)
 
     def pull(self, hold: Hold) -> float:
-        """The force between a hand and what it holds [N]; 0 if it holds nothing."""
+        """Return the force between a hand and what it holds [N]; 0 if it holds nothing."""
         data = self.data
         rows = np.flatnonzero(
             (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
@@ -189,7 +189,7 @@ class SuiteScene(RobotScene):
         return math.sqrt(float(np.square(data.efc_force[rows]).sum()))
 
     def touch(self, first: str, second: str) -> float:
-        """The normal force between two geoms, pressing [N]."""
+        """Return the normal force between two geoms, pressing [N]."""
         model, data, total, part = self.model, self.data, 0.0, np.empty(6)
         pair = {model.geom(first).id, model.geom(second).id}
         for index in range(data.ncon):
@@ -220,7 +220,7 @@ class SuiteScene(RobotScene):
         return total
 
     def snapshot(self) -> tuple[Any, ...]:
-        """The state without velocities."""
+        """Return the state without velocities."""
         model, held, taken = self.model, self.held.copy(), self.taken.copy()
         places = model.body_pos.copy(), model.body_quat.copy()  # of what is not free
         return self.data.qpos.copy(), held, taken, model.eq_data.copy(), *places
