@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_env_bimanual.rendering import Renderer
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["Observation", "StateEnv", "finite_vector"]
+__all__ = ["Array", "Observation", "StateEnv", "finite_vector"]
 
+Array = NDArray[np.float64]
 #: Arrays of numbers; ``pixels`` are pictures by the names of cameras.
 Observation = dict[str, Any]
 
@@ -83,7 +84,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._renderer = None
 
 
-def finite_vector(name: str, values: ArrayLike, length: int) -> NDArray[np.float64]:
+def finite_vector(name: str, values: ArrayLike, length: int) -> Array:
     """Copy ``length`` values, which have to be finite."""
     vector = np.array(values, dtype=np.float64)
     if vector.shape != (length,):

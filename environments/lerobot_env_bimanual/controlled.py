@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation, StateEnv
+from lerobot_env_bimanual.base import Array, Observation, StateEnv
 from lerobot_env_bimanual.disturbances import (
     NOMINAL,
     Course,
@@ -112,10 +112,10 @@ class ControlledEnv(StateEnv):
     carriers: ClassVar[Mapping[str, Carrier]] = {}
 
     _start: Start
-    _joints: NDArray[np.float64]
-    _velocity: NDArray[np.float64]
-    _reference: NDArray[np.float64]
-    _queue: NDArray[np.float64]  # references that have not reached the motors yet
+    _joints: Array
+    _velocity: Array
+    _reference: Array
+    _queue: Array  # references that have not reached the motors yet
 
     def __init__(
         self,
@@ -230,11 +230,11 @@ class ControlledEnv(StateEnv):
         """Whatever hands do by themselves, and the judge notes, after a tick."""
 
     @abstractmethod
-    def _usual(self, step: NDArray[np.float64]) -> bool:
+    def _usual(self, step: Array) -> bool:
         """Check whether the task is meant for a first object displaced so at the start."""
 
     @abstractmethod
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         """Put the first object where it stood at the start, displaced, unless it is held."""
 
     def _put_on_path(self, instant: float) -> None:
@@ -265,10 +265,10 @@ class ControlledEnv(StateEnv):
         self._start = start = self._begin(options or {})
         self._picture, self._steps = None, 0
         self._time = self._free = 0.0  # [s], and without stops
-        self._peaks: NDArray[np.float64] = np.zeros(2)
+        self._peaks: Array = np.zeros(2)
         self._rngs = generators(self.disturbances, self.np_random)
         self._drawn = tuple(
-            part.drawn(rng, self._course, self._usual)
+            part.draw(rng, self._course, self._usual)
             for part, rng in zip(self.disturbances, self._rngs, strict=True)
         )
         self._sag = sum(part.sag(len(self.joint_names)) for part in self._drawn)
@@ -328,7 +328,7 @@ class ControlledEnv(StateEnv):
             info["is_success"] = self._successful(info)
         return self._observation(), float(info["is_success"]), False, over, info
 
-    def _read_action(self, action: ArrayLike) -> NDArray[np.float64]:
+    def _read_action(self, action: ArrayLike) -> Array:
         if self._steps >= self.episode_length:
             raise DataError("no episode is going on: call reset first")
         wanted = np.asarray(action, dtype=np.float64)
@@ -343,13 +343,13 @@ class ControlledEnv(StateEnv):
             raise DataError(f"the action is not finite for {names} at step {self._steps}")
         return wanted
 
-    def _limit_reference(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _limit_reference(self, wanted: Array) -> Array:
         """Limit a reference to the joints' ranges, and to what they reach at their speed."""
         last = self._reference
         allowed = np.minimum(np.maximum(wanted, self._lower), self._upper)
         return last + np.minimum(np.maximum(allowed - last, -self._stride), self._stride)
 
-    def _move(self, goal: NDArray[np.float64]) -> float:
+    def _move(self, goal: Array) -> float:
         """Go towards a reference until the next tick; return how long that takes [s]."""
         last, usual, share = self._reference, 1000 // self.fps, 1.0
         for part, rng in zip(self._drawn, self._rngs, strict=True):
@@ -424,7 +424,7 @@ class ControlledEnv(StateEnv):
             )
         shown = self._seen
         for part, rng in zip(self._drawn, self._rngs, strict=True):
-            shown = part.seen(shown, self._shown, self._time, rng)
+            shown = part.observe(shown, self._shown, self._time, rng)
         self._shown = shown
         seen: Observation = {"agent_pos": joints, "timestamp": np.array([self._time])}
         if self.observe_objects:
@@ -433,7 +433,7 @@ class ControlledEnv(StateEnv):
             seen["pixels"] = self.eyes.pictures(self._grain)
         return seen
 
-    def _perceive_objects(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _perceive_objects(self, errors: Array) -> Array:
         """Observe the objects' poses with errors in standard deviations (n_objects, 6)."""
         poses = self._scene.objects
         if self.noise:

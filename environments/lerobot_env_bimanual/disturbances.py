@@ -27,6 +27,9 @@ __all__ = [
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
+Rng = np.random.Generator
+#: Whether an object that is displaced so (6,) stands where the task is meant for.
+Usual = Callable[[Vector], bool]
 #: The condition without disturbances.
 NOMINAL = "nominal"
 #: No disturbance begins before [s].
@@ -76,16 +79,8 @@ class Disturbance:
         """Between which times its ``moment`` is drawn [s]; None without a moment."""
         return None
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
-        """Draw everything that is random about the disturbance.
-
-        Parameters
-        ----------
-        usual : callable
-            Whether an object that is displaced so (6,) stands where the task is meant for.
-        """
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
+        """Draw everything that is random about the disturbance."""
         window = self.window(course)
         if window is None:
             return self
@@ -97,14 +92,12 @@ class Disturbance:
         """Check whether the robot is stopped."""
         return False
 
-    def period(self, rng: np.random.Generator) -> float:
+    def period(self, rng: Rng) -> float:
         """Return the time to the next tick, in multiples of what it should be."""
         return 1.0
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
-        """Observed poses of the objects.
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
+        """Observe the poses of the objects.
 
         Parameters
         ----------
@@ -259,11 +252,9 @@ class Moved(Disturbance):
         """On the way to the object."""
         return FIRST, course.grasp - APPROACH - self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """On the way to the object, and within its usual places if it is in one of them."""
-        drawn = super().drawn(rng, course, usual)
+        drawn = super().draw(rng, course, usual)
         anywhere = not usual(np.zeros(6))
         # where its usual places are narrower than the step, none of whole length may be left
         for share in np.repeat(np.linspace(1, 0.1, 10), 1000):
@@ -299,9 +290,7 @@ class NoisyPose(Disturbance):
     distance: float = 0.005
     angle: float = math.radians(2)
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """With independent normal errors."""
         noisy = poses.copy()
         spread = np.repeat((self.distance, self.angle), 3)
@@ -322,9 +311,7 @@ class _Lasting(Disturbance):
 
     seed: int = 0
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """With a seed of the episode."""
         return dataclasses.replace(self, seed=int(rng.integers(2**32)))
 
@@ -342,9 +329,7 @@ class Biased(_Lasting):
     distance: float = 0.005
     angle: float = math.radians(2)
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """With the errors of the episode."""
         biased, own = poses.copy(), np.random.default_rng(self.seed)
         for pose in biased.reshape(-1, POSE):
@@ -370,9 +355,7 @@ class Misplaced(_Lasting):
     height: float = 0.0
     angle: float = 0.0
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """Observe it above or below its place, or tilted."""
         thought, way = poses.copy(), np.random.default_rng(self.seed).uniform(0, 2 * math.pi)
         tilt = self.angle * np.array((math.cos(way), math.sin(way), 0.0))
@@ -429,9 +412,7 @@ class PoseLost(Disturbance):
         """At any moment before the grasp, after which the poses would matter less."""
         return FIRST, course.grasp
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """NaN, or what was seen last."""
         if not self.moment <= time < self.moment + self.seconds:
             return poses
@@ -457,7 +438,7 @@ class IrregularTicks(Disturbance):
     jitter: float = 0.5
     lost: float = 0.1
 
-    def period(self, rng: np.random.Generator) -> float:
+    def period(self, rng: Rng) -> float:
         """Between half of it and three halves, or one more."""
         return float(1 + self.jitter * rng.uniform(-1, 1) + (rng.random() < self.lost))
 
@@ -493,13 +474,11 @@ class Spoilt(Disturbance):
         """To try again."""
         return self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """With the displacement of the episode, as of :class:`Moved`."""
         if not self.distance:
             return self
-        moved = Moved(self.distance, 0.0, step=self.step).drawn(rng, course, usual)
+        moved = Moved(self.distance, 0.0, step=self.step).draw(rng, course, usual)
         return dataclasses.replace(self, step=moved.step)
 
 
@@ -593,9 +572,7 @@ def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
     return dataclasses.replace(usual, **signed)
 
 
-def generators(
-    disturbances: Sequence[Disturbance], rng: np.random.Generator
-) -> list[np.random.Generator]:
+def generators(disturbances: Sequence[Disturbance], rng: Rng) -> list[Rng]:
     """Random numbers for each disturbance, the same whatever else disturbs the episode.
 
     Parameters

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut, slid
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
@@ -47,7 +47,6 @@ __all__ = [
     "record_calibration",
 ]  # fmt: skip
 
-Vector = NDArray[np.float64]
 #: Time steps per second of the experts' motions, whatever the rate of the set.
 RATE = 100.0
 #: The task of showing tags to the cameras, and the first tag of the cube in each hand.
@@ -75,11 +74,11 @@ class Expert:
     environment: Callable[..., ControlledEnv]
     motion: Callable[[int], Demonstration] | None
     objects: tuple[str, ...]
-    actions: Callable[[Any, np.random.Generator], Iterable[Vector]] | None = None
+    actions: Callable[[Any, np.random.Generator], Iterable[Array]] | None = None
 
     def begin(
         self, env: ControlledEnv, rng: np.random.Generator
-    ) -> tuple[dict[str, Any], Iterable[Vector]]:
+    ) -> tuple[dict[str, Any], Iterable[Array]]:
         """Begin an episode: what is observed, and the actions."""
         motion = self.motion(int(rng.integers(2**31))) if self.motion else None
         start, seed = {} if motion is None else self.start(motion), int(rng.integers(2**31))
@@ -272,7 +271,7 @@ def record_calibration(
     cell |= {"joint_offsets": {env.joint_names[i]: float(offsets[i]) for i in moved}}
     postures = calibration.varied_postures(rig, hand, n, rng)
 
-    def measure(joints: Vector) -> Vector:
+    def measure(joints: Array) -> Array:
         noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
         return np.asarray(joints - offsets + noise)
 

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import SLIDE, TASK, CarryAndPut, slide
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
@@ -167,7 +167,7 @@ class CarryAndPutEnv(BottleEnv):
         start, standing = self._start, self._standing()
         return _path(*map(tuple, (start.joints, standing, start.poses["tray"], start.slide)))
 
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: Array) -> bool:
         return carrying().usual(Frame(bottle[:3], bottle[3:]))
 
 

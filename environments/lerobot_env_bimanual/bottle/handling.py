@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.measures import Closing
 from lerobot_env_bimanual.bottle.scene import CARRIERS, BottleScene, Snapshot
@@ -56,7 +56,7 @@ class BottleEnv(ControlledEnv):
         """
 
     @abstractmethod
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: Array) -> bool:
         """Check whether the task is meant for a bottle there."""
 
     def _begin(self, options: Mapping[str, Any]) -> Start:
@@ -108,7 +108,7 @@ class BottleEnv(ControlledEnv):
         self._contact = self._scene.joints, self._scene.bottle
         self._scene.hold()
 
-    def _since_grasp(self) -> NDArray[np.float64]:
+    def _since_grasp(self) -> Array:
         """Joints [rad] and the bottle's height [m], (T, 18), at the rate of the control."""
         first = self._counted if self._grasp_step is None else self._grasp_step
         times, motion = (part[first : self._counted] for part in (self._instants, self._motion))
@@ -117,10 +117,10 @@ class BottleEnv(ControlledEnv):
         grid = np.arange(times[0], times[-1], 1 / self.fps)
         return np.stack([np.interp(grid, times, column) for column in motion.T], axis=1)
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
+    def _usual(self, step: Array) -> bool:
         return self._stands_usually(displace_pose(self._start.poses["bottle"], step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         if self._grasp_step is None:
             self._scene.put_bottle(displace_pose(self._start.poses["bottle"], step))
 
@@ -139,7 +139,7 @@ class BottleEnv(ControlledEnv):
         self._scene.place(_at(path, instant), max(0.0, held_for))
         self._hold_still()
 
-    def _standing(self) -> NDArray[np.float64]:
+    def _standing(self) -> Array:
         """Return the bottle's pose, or that when it was last free; shape (7,)."""
         return self._scene.bottle if self._grasp_step is None else self._contact[1]
 
@@ -151,7 +151,7 @@ class BottleEnv(ControlledEnv):
         return float(path.time[distance.argmin()])
 
 
-def _at(path: Demonstration, instant: float) -> NDArray[np.float64]:
+def _at(path: Demonstration, instant: float) -> Array:
     """Interpolate the posture at an instant."""
     time, joints = path.time.numpy(), path.joints.numpy()
     return np.array([np.interp(instant, time, column) for column in joints.T])

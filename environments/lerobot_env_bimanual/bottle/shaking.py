@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import find_shaking, successful
@@ -133,7 +133,7 @@ class BottleShakingEnv(BottleEnv):
     def _nominal(self) -> Demonstration:
         return _path(tuple(self._start.joints), tuple(self._standing()))
 
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: Array) -> bool:
         return skill().usual(Frame(bottle[:3], bottle[3:]))
 
 

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course, displace_pose
@@ -142,7 +142,7 @@ class BiSo101Env(ControlledEnv):
         """The simulated world, which an expert sees."""
         return self._scene
 
-    def in_stored_units(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    def in_stored_units(self, joints: Array) -> Array:
         """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
         return np.asarray((joints - self._zero) / self._factor)
 
@@ -188,7 +188,7 @@ class BiSo101Env(ControlledEnv):
         self._reference = np.array(self._scene.data.ctrl)
         self._queue = np.tile(self._reference, (self._start.delay + 1, 1))
 
-    def _read_action(self, action: ArrayLike) -> NDArray[np.float64]:
+    def _read_action(self, action: ArrayLike) -> Array:
         return super()._read_action(action) * self._factor + self._zero
 
     def _observation(self) -> Observation:
@@ -198,9 +198,9 @@ class BiSo101Env(ControlledEnv):
     def _act(self, stopped: bool) -> None:
         self._scene.grip()
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
+    def _usual(self, step: Array) -> bool:
         return CUP_BOX.contains(displace_pose(self._start.poses["cup"], step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         if RIGHT not in self._scene.taken:
             self._scene.put("cup", displace_pose(self._start.poses["cup"], step))

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.so101.env import OPEN, BiSo101Env
 from lerobot_env_bimanual.so101.kinematics import ARM, Reach
 from lerobot_env_bimanual.so101.scene import (
@@ -27,7 +27,6 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["MEETING", "PHASES", "teleoperate"]
 
-Array = NDArray[np.float64]
 #: Nominal seconds of the phases, which differ by up to a share.
 PHASES = {
     "reach": 2.2, "approach": 1.2, "close": 1.4, "lift": 1.0, "bring": 2.2, "hover": 0.4,

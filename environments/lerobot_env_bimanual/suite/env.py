@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Closing, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import (
@@ -193,16 +192,16 @@ class SuiteEnv(ControlledEnv):
                 if part.step is not None:
                     self._displace(part.step)
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
+    def _usual(self, step: Array) -> bool:
         return self._task.usual(displace_pose(self._first, step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         name = self._task.objects[0]
         if not any(hold.thing == name for hold in self._scene.taken):
             self._scene.put(name, displace_pose(self._first, step))
 
     @property
-    def _first(self) -> NDArray[np.float64]:
+    def _first(self) -> Array:
         """Initial pose of the first object."""
         return self._start.poses[self._task.objects[0]]
 

@@ -16,9 +16,9 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
@@ -193,11 +193,11 @@ class _Judge(Judge):
     def __init__(self) -> None:
         self.full = 1.0
         self.poured = self.spilled = self.lean = 0.0
-        self.mouth: NDArray[np.float64] | None = None
+        self.mouth: Array | None = None
         # what falls: how much of it, where, how fast
-        self.amounts: NDArray[np.float64] = np.zeros(0)
-        self.places: NDArray[np.float64] = np.zeros((0, 3))
-        self.speeds: NDArray[np.float64] = np.zeros((0, 3))
+        self.amounts: Array = np.zeros(0)
+        self.places: Array = np.zeros((0, 3))
+        self.speeds: Array = np.zeros((0, 3))
 
     def note(self, scene: SuiteScene, seconds: float) -> None:
         before = _seen(scene, self.places)
@@ -209,9 +209,7 @@ class _Judge(Judge):
         self._arrive(before, _seen(scene, self.places), _lean(scene, "cup") <= UPRIGHT)
         self._flow(scene, seconds)
 
-    def _arrive(
-        self, before: NDArray[np.float64], after: NDArray[np.float64], upright: bool
-    ) -> None:
+    def _arrive(self, before: Array, after: Array, upright: bool) -> None:
         """Count what came down to the cup's rim between two instants, seen from the cup."""
         down = after[:, 2] <= CUP_HALF
         before, after = before[down], after[down]
@@ -249,7 +247,7 @@ class _Judge(Judge):
         }
 
 
-def _seen(scene: SuiteScene, places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _seen(scene: SuiteScene, places: Array) -> Array:
     """Places (n, 3) as seen from the cup [m]."""
     cup = scene.data.body("cup")
     return np.asarray((places - cup.xpos) @ cup.xmat.reshape(3, 3))

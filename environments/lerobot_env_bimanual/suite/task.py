@@ -17,9 +17,9 @@ from typing import ClassVar, NamedTuple
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
@@ -42,7 +42,7 @@ __all__ = [
     "shift_pose", "vector",
 ]  # fmt: skip
 
-Pose = NDArray[np.float64]
+Pose = Array
 #: Durations differ by up to this share.
 STRETCH = 0.2
 #: Start postures differ by up to this in each joint, and the posture that the null space seeks
@@ -244,7 +244,7 @@ class SuiteTask(ABC):
         """Return the pose of a hand that waits beside a thing with a pose."""
         return shift_pose(attached(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
 
-    def start_posture(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def start_posture(self, rng: np.random.Generator) -> Array:
         """Around the neutral one, shape (n_joints,) [rad]."""
         spread = rng.uniform(-START, START, self.robot.n_joints)
         posture = self.embodiment.posture.numpy() + spread
@@ -287,7 +287,7 @@ class SuiteTask(ABC):
         )
 
     def nominal(
-        self, poses: Mapping[str, Pose], joints: NDArray[np.float64], rate: float = 100.0
+        self, poses: Mapping[str, Pose], joints: Array, rate: float = 100.0
     ) -> Demonstration:
         """Motion of the expert without noise.
 
