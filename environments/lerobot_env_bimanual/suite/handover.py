@@ -7,7 +7,7 @@ holds; afterwards the thing moves with another hand.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -20,8 +20,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -88,9 +90,7 @@ class Handover(SuiteTask):
         baton = BOX.draw(rng)
         return {"baton": baton, "stand": BOX.across(baton[2] - FOOT).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the baton, to the meeting, and back; right to the meeting and the stand."""
         baton, stand = poses["baton"], poses["stand"]
         meeting = Frame(vector(MEETING) + style.free * vector(MEETING_SPREAD))

@@ -8,7 +8,7 @@ the chord between them pulls the box away, or loses the grip.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -24,8 +24,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -112,9 +114,7 @@ class Lid(SuiteTask):
         """Draw the box a little to the right of the middle."""
         return {"box": AREA.draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the box's side and back; right to the knob, about the hinge and back."""
         box = poses["box"]
         opened = torch.deg2rad(OPENED + SPREAD * style.free[:, 0])

@@ -9,7 +9,7 @@ hole it jams: both arms give way, as stiff as their position control, and the fo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -25,8 +25,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -115,9 +117,7 @@ class PegInHole(SuiteTask):
         peg = AREA.draw(rng)
         return {"peg": peg, "block": AREA.across(peg[2] - LENGTH + HEIGHT).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the block and the meeting; right to the peg, beside, above, and in."""
         peg, block = poses["peg"], poses["block"]
         # nobody turns them on the way

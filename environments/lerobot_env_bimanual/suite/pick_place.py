@@ -7,7 +7,7 @@ is hard; the conditions ``slips`` and ``knocked`` spoil the first grasp.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
@@ -29,8 +29,10 @@ from lerobot_env_bimanual.suite.handover import (
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     raise_pose,
@@ -73,9 +75,7 @@ class PickPlace(Handover):
         low, high = ((*corner, baton[2] - FOOT) for corner in STANDS)
         return {"baton": baton, "stand": Box(low, high, BOX.yaw).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the baton, up, to the stand, and back; right nowhere."""
         baton, stand, hand = poses["baton"], poses["stand"], "l_hand"
         place = Frame(stand.transform(vector((0.0, 0.0, FOOT))), stand.orientation)

@@ -9,7 +9,7 @@ vertical is free: the mouth's place and the jug's turn only go together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from typing import ClassVar
 
@@ -26,8 +26,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -114,9 +116,7 @@ class Pour(SuiteTask):
         cup = BOX.draw(rng)
         return {"cup": cup, "jug": BOX.across(cup[2] - CUP_HALF + JUG_HALF).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Right to the cup, and lifts it; left to the jug, over the cup, and back."""
         cup, jug = poses["cup"], poses["jug"]
         aside = dict(zip(GRIP, style.aim.unbind(1), strict=True))

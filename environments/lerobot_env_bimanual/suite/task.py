@@ -38,8 +38,8 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
 __all__ = [
-    "Box", "Judge", "Leg", "Pose", "Style", "SuiteTask", "hands_along", "raise_pose", "seen",
-    "shift_pose", "vector",
+    "Box", "Frames", "Judge", "Leg", "Legs", "Pose", "Style", "SuiteTask", "hands_along",
+    "raise_pose", "seen", "shift_pose", "vector",
 ]  # fmt: skip
 
 Pose = Array
@@ -115,6 +115,11 @@ class Leg:
     phase: str
     target: Frame | Callable[[Tensor], Frame]
     free: bool = False
+
+
+#: Poses by names, and the ways of both hands.
+Frames = Mapping[str, Frame]
+Legs = Mapping[str, Sequence[Leg]]
 
 
 class Judge(ABC):
@@ -196,9 +201,7 @@ class SuiteTask(ABC):
         return self.box.contains(pose)
 
     @abstractmethod
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Lay out the ways of both hands.
 
         Parameters
@@ -341,8 +344,8 @@ class SuiteTask(ABC):
 
 
 def hands_along(
-    starts: Mapping[str, Frame],
-    legs: Mapping[str, Sequence[Leg]],
+    starts: Frames,
+    legs: Legs,
     progress: Mapping[str, Tensor],
     bow: Tensor,
 ) -> list[Frame]:

@@ -8,7 +8,6 @@ instants say neither; nor is the force anywhere in the observation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import mujoco
@@ -23,8 +22,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -127,9 +128,7 @@ class Wipe(SuiteTask):
         level = math.degrees(float(tilt.abs().max())) <= TILT + 1e-6
         return AREA.surrounds(pose) and turned and level
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the edge and back; right to the board, over it in a zigzag, and back."""
         board = poses["board"]
         left, right = style.aim.unbind(1)
