@@ -11,7 +11,6 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.eyes.rig import IMAGES, Rig
 from tpgmm_datasets.lerobot.columns import with_frames
 from tpgmm_torch.atomic import replacing
@@ -110,25 +109,25 @@ def recording(
 
 
 def rig_to_record(
-    env: ControlledEnv,
+    env: Any,
     n: int,
     cameras: str | Sequence[str],
     size: tuple[int, int],
     **options: Any,
 ) -> Rig:
-    """Set up cameras before an environment, for a set of ``n`` episodes or postures."""
+    """Set up cameras before a ``ControlledEnv``, for a set of ``n`` episodes or postures."""
     if n < 1:
         raise DataError(f"at least one episode is recorded, got n={n}")
-    rig = env.rig(cameras, size, **options)
+    rig: Rig = env.rig(cameras, size, **options)
     if not rig.views:
         raise DataError("a set with videos needs a camera: --cameras front")
     return rig
 
 
 def recording_of(
-    env: ControlledEnv, rig: Rig, out: str | Path, cell: Mapping[str, Any], **options: Any
+    env: Any, rig: Rig, out: str | Path, cell: Mapping[str, Any], **options: Any
 ) -> AbstractContextManager[Any]:
-    """Open a set for what an environment does and a rig sees, as :func:`recording` does."""
+    """Open a set for what a ``ControlledEnv`` does and a rig sees, as :func:`recording` does."""
     names = [name + env.suffix for name in env.joint_names]
     camera = rig.lens.camera
     sizes = dict.fromkeys(rig.views, (camera.width, camera.height))
