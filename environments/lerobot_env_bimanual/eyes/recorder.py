@@ -127,7 +127,7 @@ def rig_to_record(
 def recording_of(
     env: Any, rig: Rig, out: str | Path, cell: Mapping[str, Any], **options: Any
 ) -> AbstractContextManager[Any]:
-    """Open a set for what a ``ControlledEnv`` does and a rig sees, as :func:`recording` does."""
+    """Open a set, as :func:`recording` does, for a ``ControlledEnv`` and what a rig sees."""
     names = [name + env.suffix for name in env.joint_names]
     camera = rig.lens.camera
     sizes = dict.fromkeys(rig.views, (camera.width, camera.height))
