@@ -43,7 +43,7 @@ def _parts(name: str) -> Iterator[str]:
     rows = [
         f"| `{name}` | {figure.heading} | {_bounds(figure.low, figure.high)} |"
         for name, figure in task.figures.items()
-        if figure.limited
+        if figure.has_limit
     ]
     yield "\n".join(("| figure | | in a success |", "|---|---|---|", *rows))
     yield COMMANDS.format(name=name)

@@ -62,12 +62,12 @@ class _StateEnvConfig(EnvConfig):
 
     @property
     def package_name(self) -> str:
-        """Where gymnasium's name is registered."""
+        """Package in which gymnasium's name is registered."""
         return _PACKAGE
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
+        """Return the environment's options, without those that are left to it."""
         general = {setting.name for setting in fields(EnvConfig)} - {"fps"}
         options = {
             setting.name: getattr(self, setting.name)
@@ -119,7 +119,7 @@ class _TaskEnvConfig(_StateEnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
+        """Return the environment's options, without those that are left to it."""
         return {"task": self.task, **super().gym_kwargs}
 
     def _observe(self, objects: Mapping[str, Sequence[str]], n_joints: int) -> None:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_env_bimanual.rendering import Renderer
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["Observation", "StateEnv", "finite_vector"]
+__all__ = ["Array", "Observation", "StateEnv", "finite_vector"]
 
+Array = NDArray[np.float64]
 #: Arrays of numbers; ``pixels`` are pictures by the names of cameras.
 Observation = dict[str, Any]
 
@@ -59,7 +60,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         raise NotImplementedError
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """A picture, at most 25 new ones per simulated second.
+        """Draw a picture, at most 25 new ones per simulated second.
 
         Returns
         -------
@@ -83,8 +84,8 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._renderer = None
 
 
-def finite_vector(name: str, values: ArrayLike, length: int) -> NDArray[np.float64]:
-    """A copy of ``length`` finite values."""
+def finite_vector(name: str, values: ArrayLike, length: int) -> Array:
+    """Copy ``length`` values, which have to be finite."""
     vector = np.array(values, dtype=np.float64)
     if vector.shape != (length,):
         raise ShapeError(f"{name} needs {length} values, shape ({length},), got {vector.shape}")

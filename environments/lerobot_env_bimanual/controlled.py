@@ -10,14 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation, StateEnv
+from lerobot_env_bimanual.base import Array, Observation, StateEnv
 from lerobot_env_bimanual.disturbances import (
     NOMINAL,
     Course,
     Disturbance,
-    displaced,
+    displace_pose,
     generators,
     parse_condition,
 )
@@ -112,10 +112,10 @@ class ControlledEnv(StateEnv):
     carriers: ClassVar[Mapping[str, Carrier]] = {}
 
     _start: Start
-    _joints: NDArray[np.float64]
-    _velocity: NDArray[np.float64]
-    _reference: NDArray[np.float64]
-    _queue: NDArray[np.float64]  # references that have not reached the motors yet
+    _joints: Array
+    _velocity: Array
+    _reference: Array
+    _queue: Array  # references that have not reached the motors yet
 
     def __init__(
         self,
@@ -215,11 +215,11 @@ class ControlledEnv(StateEnv):
 
     @abstractmethod
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
 
     @abstractmethod
     def _successful(self, figures: Mapping[str, float]) -> bool:
-        """Whether the figures at the end are those of a success."""
+        """Check whether the figures at the end are those of a success."""
 
     @abstractmethod
     def _begin(self, options: Mapping[str, Any]) -> Start:
@@ -230,11 +230,11 @@ class ControlledEnv(StateEnv):
         """Whatever hands do by themselves, and the judge notes, after a tick."""
 
     @abstractmethod
-    def _usual(self, step: NDArray[np.float64]) -> bool:
-        """Whether the task is meant for a first object that is displaced so at the start."""
+    def _usual(self, step: Array) -> bool:
+        """Check whether the task is meant for a first object displaced so at the start."""
 
     @abstractmethod
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         """Put the first object where it stood at the start, displaced, unless it is held."""
 
     def _put_on_path(self, instant: float) -> None:
@@ -242,7 +242,7 @@ class ControlledEnv(StateEnv):
         raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
     def _instant(self) -> float:
-        """Where on the nominal path the robot is [s]."""
+        """Return the instant of the nominal path at which the robot is [s]."""
         raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
     def reset(
@@ -265,10 +265,10 @@ class ControlledEnv(StateEnv):
         self._start = start = self._begin(options or {})
         self._picture, self._steps = None, 0
         self._time = self._free = 0.0  # [s], and without stops
-        self._peaks: NDArray[np.float64] = np.zeros(2)
+        self._peaks: Array = np.zeros(2)
         self._rngs = generators(self.disturbances, self.np_random)
         self._drawn = tuple(
-            part.drawn(rng, self._course, self._usual)
+            part.draw(rng, self._course, self._usual)
             for part, rng in zip(self.disturbances, self._rngs, strict=True)
         )
         self._sag = sum(part.sag(len(self.joint_names)) for part in self._drawn)
@@ -276,7 +276,7 @@ class ControlledEnv(StateEnv):
         self._grain = np.random.default_rng(zlib.crc32(start.joints.tobytes()))
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Any]] = []
-        self._shown = self._seen = self._perceived(start.misperception.reshape(-1, 6))
+        self._shown = self._seen = self._perceive_objects(start.misperception.reshape(-1, 6))
         for part in self._drawn:
             if part.start():
                 self._put_on_path(part.start())
@@ -307,9 +307,9 @@ class ControlledEnv(StateEnv):
         DataError
             If it is not finite, no episode is going on, or the simulation diverges.
         """
-        wanted = self._checked(action)
+        wanted = self._read_action(action)
         stopped = any(part.stops(self._time) for part in self._drawn)
-        goal = self._reference if stopped else self._limited(wanted)
+        goal = self._reference if stopped else self._limit_reference(wanted)
         clipped = float(np.abs(wanted - goal).max())
         seconds = self._move(goal)
         # in whole milliseconds, so that no sum is rounded
@@ -328,7 +328,7 @@ class ControlledEnv(StateEnv):
             info["is_success"] = self._successful(info)
         return self._observation(), float(info["is_success"]), False, over, info
 
-    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
+    def _read_action(self, action: ArrayLike) -> Array:
         if self._steps >= self.episode_length:
             raise DataError("no episode is going on: call reset first")
         wanted = np.asarray(action, dtype=np.float64)
@@ -343,13 +343,13 @@ class ControlledEnv(StateEnv):
             raise DataError(f"the action is not finite for {names} at step {self._steps}")
         return wanted
 
-    def _limited(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A reference within the joints' ranges, and in reach at their speed."""
+    def _limit_reference(self, wanted: Array) -> Array:
+        """Limit a reference to the joints' ranges, and to what they reach at their speed."""
         last = self._reference
         allowed = np.minimum(np.maximum(wanted, self._lower), self._upper)
         return last + np.minimum(np.maximum(allowed - last, -self._stride), self._stride)
 
-    def _move(self, goal: NDArray[np.float64]) -> float:
+    def _move(self, goal: Array) -> float:
         """Go towards a reference until the next tick; return how long that takes [s]."""
         last, usual, share = self._reference, 1000 // self.fps, 1.0
         for part, rng in zip(self._drawn, self._rngs, strict=True):
@@ -367,7 +367,7 @@ class ControlledEnv(StateEnv):
         return n / 1000
 
     def _record(self, seconds: float, stopped: bool) -> None:
-        """How hard the robot moves; while it is stopped it is not judged."""
+        """Record how hard the robot moves; while it is stopped it is not judged."""
         joints = self._scene.joints
         velocity = (joints - self._joints) / seconds
         if not stopped:
@@ -388,9 +388,9 @@ class ControlledEnv(StateEnv):
             elif seconds > 0:
                 self._put_on_path(self._instant() + seconds)
         if self._returns:
-            self._past.append((self._time, self._remembered()))
+            self._past.append((self._time, self._take_snapshot()))
 
-    def _remembered(self) -> Any:
+    def _take_snapshot(self) -> Any:
         """State that :meth:`_restore` needs."""
         return self._scene.snapshot()
 
@@ -419,10 +419,12 @@ class ControlledEnv(StateEnv):
             joints += self.noise * NOISE_JOINTS * draw(len(joints))
         if self._live:
             n = len(self._scene.objects)
-            self._seen = self._perceived(draw((n, 6)) if self.noise else np.zeros((n, 6)))
+            self._seen = self._perceive_objects(
+                draw((n, 6)) if self.noise else np.zeros((n, 6))
+            )
         shown = self._seen
         for part, rng in zip(self._drawn, self._rngs, strict=True):
-            shown = part.seen(shown, self._shown, self._time, rng)
+            shown = part.observe(shown, self._shown, self._time, rng)
         self._shown = shown
         seen: Observation = {"agent_pos": joints, "timestamp": np.array([self._time])}
         if self.observe_objects:
@@ -431,12 +433,12 @@ class ControlledEnv(StateEnv):
             seen["pixels"] = self.eyes.pictures(self._grain)
         return seen
 
-    def _perceived(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The objects' poses with errors given in standard deviations (n_objects, 6)."""
+    def _perceive_objects(self, errors: Array) -> Array:
+        """Observe the objects' poses with errors in standard deviations (n_objects, 6)."""
         poses = self._scene.objects
         if self.noise:
             poses = [
-                np.clip(displaced(pose, self.noise * NOISE_POSE * error), -RANGE, RANGE)
+                np.clip(displace_pose(pose, self.noise * NOISE_POSE * error), -RANGE, RANGE)
                 for pose, error in zip(poses, errors, strict=True)
             ]
         return np.concatenate(poses)

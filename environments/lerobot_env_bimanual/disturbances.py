@@ -23,10 +23,13 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 __all__ = [
     "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
     "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "Spoilt",
-    "StartedMidway", "Stopped", "displaced", "generators", "parse_condition",
+    "StartedMidway", "Stopped", "displace_pose", "generators", "parse_condition",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
+Rng = np.random.Generator
+#: Whether an object that is displaced so (6,) stands where the task is meant for.
+Usual = Callable[[Vector], bool]
 #: The condition without disturbances.
 NOMINAL = "nominal"
 #: No disturbance begins before [s].
@@ -76,16 +79,8 @@ class Disturbance:
         """Between which times its ``moment`` is drawn [s]; None without a moment."""
         return None
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
-        """The disturbance with everything that is random about it.
-
-        Parameters
-        ----------
-        usual : callable
-            Whether an object that is displaced so (6,) stands where the task is meant for.
-        """
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
+        """Draw everything that is random about the disturbance."""
         window = self.window(course)
         if window is None:
             return self
@@ -94,17 +89,15 @@ class Disturbance:
         return dataclasses.replace(self, **{"moment": moment if math.isnan(given) else given})
 
     def stops(self, time: float) -> bool:
-        """Whether the robot is stopped."""
+        """Check whether the robot is stopped."""
         return False
 
-    def period(self, rng: np.random.Generator) -> float:
-        """The time to the next tick, in multiples of what it should be."""
+    def period(self, rng: Rng) -> float:
+        """Return the time to the next tick, in multiples of what it should be."""
         return 1.0
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
-        """Observed poses of the objects.
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
+        """Observe the poses of the objects.
 
         Parameters
         ----------
@@ -114,18 +107,18 @@ class Disturbance:
         return poses
 
     def displacement(self, time: float) -> Vector | None:
-        """How far somebody has moved the first object, shape (6,): [m], then [rad].
+        """Return how far somebody has moved the first object, shape (6,): [m], then [rad].
 
         None where nobody touches it.
         """
         return None
 
     def shove(self, begin: float, end: float) -> float:
-        """The seconds of the task by which the robot is displaced between two times."""
+        """Return the seconds of the task by which the robot is displaced between two times."""
         return 0.0
 
     def start(self) -> float:
-        """Where in the task the episode begins [s]."""
+        """Return the instant of the task at which the episode begins [s]."""
         return 0.0
 
     def sag(self, n_joints: int) -> Vector:
@@ -259,11 +252,9 @@ class Moved(Disturbance):
         """On the way to the object."""
         return FIRST, course.grasp - APPROACH - self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """On the way to the object, and within its usual places if it is in one of them."""
-        drawn = super().drawn(rng, course, usual)
+        drawn = super().draw(rng, course, usual)
         anywhere = not usual(np.zeros(6))
         # where its usual places are narrower than the step, none of whole length may be left
         for share in np.repeat(np.linspace(1, 0.1, 10), 1000):
@@ -299,14 +290,12 @@ class NoisyPose(Disturbance):
     distance: float = 0.005
     angle: float = math.radians(2)
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """With independent normal errors."""
         noisy = poses.copy()
         spread = np.repeat((self.distance, self.angle), 3)
         for pose in noisy.reshape(-1, POSE):
-            pose[:] = displaced(pose, spread * rng.standard_normal(6))
+            pose[:] = displace_pose(pose, spread * rng.standard_normal(6))
         return noisy
 
 
@@ -322,9 +311,7 @@ class _Lasting(Disturbance):
 
     seed: int = 0
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """With a seed of the episode."""
         return dataclasses.replace(self, seed=int(rng.integers(2**32)))
 
@@ -342,16 +329,14 @@ class Biased(_Lasting):
     distance: float = 0.005
     angle: float = math.radians(2)
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """With the errors of the episode."""
         biased, own = poses.copy(), np.random.default_rng(self.seed)
         for pose in biased.reshape(-1, POSE):
             axes = own.standard_normal((2, 3))
             axes /= np.linalg.norm(axes, axis=1, keepdims=True)
             error = (self.distance * axes[0], self.angle * axes[1])
-            pose[:] = displaced(pose, np.concatenate(error))
+            pose[:] = displace_pose(pose, np.concatenate(error))
         return biased
 
 
@@ -370,10 +355,8 @@ class Misplaced(_Lasting):
     height: float = 0.0
     angle: float = 0.0
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
-        """Where it is not."""
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
+        """Observe it above or below its place, or tilted."""
         thought, way = poses.copy(), np.random.default_rng(self.seed).uniform(0, 2 * math.pi)
         tilt = self.angle * np.array((math.cos(way), math.sin(way), 0.0))
         for pose in thought.reshape(-1, POSE):
@@ -381,7 +364,7 @@ class Misplaced(_Lasting):
             upwards = np.array(
                 (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
             )
-            pose[:] = displaced(pose, np.concatenate((-self.height * upwards, tilt)))
+            pose[:] = displace_pose(pose, np.concatenate((-self.height * upwards, tilt)))
         return thought
 
 
@@ -429,9 +412,7 @@ class PoseLost(Disturbance):
         """At any moment before the grasp, after which the poses would matter less."""
         return FIRST, course.grasp
 
-    def seen(
-        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
-    ) -> Vector:
+    def observe(self, poses: Vector, last: Vector, time: float, rng: Rng) -> Vector:
         """NaN, or what was seen last."""
         if not self.moment <= time < self.moment + self.seconds:
             return poses
@@ -457,7 +438,7 @@ class IrregularTicks(Disturbance):
     jitter: float = 0.5
     lost: float = 0.1
 
-    def period(self, rng: np.random.Generator) -> float:
+    def period(self, rng: Rng) -> float:
         """Between half of it and three halves, or one more."""
         return float(1 + self.jitter * rng.uniform(-1, 1) + (rng.random() < self.lost))
 
@@ -493,13 +474,11 @@ class Spoilt(Disturbance):
         """To try again."""
         return self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """With the displacement of the episode, as of :class:`Moved`."""
         if not self.distance:
             return self
-        moved = Moved(self.distance, 0.0, step=self.step).drawn(rng, course, usual)
+        moved = Moved(self.distance, 0.0, step=self.step).draw(rng, course, usual)
         return dataclasses.replace(self, step=moved.step)
 
 
@@ -536,7 +515,7 @@ CONDITIONS = (
 
 
 def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance, ...]:
-    """The disturbances that a text names, always in the same order.
+    """Parse the disturbances that a text names, always in the same order.
 
     Parameters
     ----------
@@ -564,16 +543,22 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         return tuple(condition)
     found: dict[str, Disturbance] = {}
     for text in () if condition == NOMINAL else condition.split("+"):
-        match = re.fullmatch(rf"([a-z]+(?:-[a-z]+)*)(?:-{_NUMBER})?(?:@{_NUMBER})?", text)
-        kind, *numbers = match.groups() if match else (text,)
-        if kind not in _KINDS:
-            where = "the conditions of the environment"
-            raise UnknownNameError("disturbance", text, where, (NOMINAL, *_KINDS))
+        kind, numbers = _split(text)
         if kind in found:
             raise DataError(f"{condition!r} names {kind} twice")
-        given = zip(("seconds", "moment"), numbers, strict=True)
-        found[kind] = _with(kind, {name: float(text) for name, text in given if text})
+        found[kind] = _with(kind, numbers)
     return tuple(found[kind] for kind in _KINDS if kind in found)
+
+
+def _split(text: str) -> tuple[str, dict[str, float]]:
+    """Split the text of one disturbance into its kind and the numbers behind it."""
+    match = re.fullmatch(rf"([a-z]+(?:-[a-z]+)*)(?:-{_NUMBER})?(?:@{_NUMBER})?", text)
+    kind, *numbers = match.groups() if match else (text,)
+    if kind not in _KINDS:
+        where = "the conditions of the environment"
+        raise UnknownNameError("disturbance", text, where, (NOMINAL, *_KINDS))
+    given = zip(("seconds", "moment"), numbers, strict=True)
+    return kind, {name: float(number) for name, number in given if number}
 
 
 def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
@@ -587,9 +572,7 @@ def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
     return dataclasses.replace(usual, **signed)
 
 
-def generators(
-    disturbances: Sequence[Disturbance], rng: np.random.Generator
-) -> list[np.random.Generator]:
+def generators(disturbances: Sequence[Disturbance], rng: Rng) -> list[Rng]:
     """Random numbers for each disturbance, the same whatever else disturbs the episode.
 
     Parameters
@@ -603,8 +586,8 @@ def generators(
     return [np.random.default_rng((key, zlib.crc32(name.encode()))) for name in names]
 
 
-def displaced(pose: Vector, error: Vector) -> Vector:
-    """A pose (7,) that is off by ``error`` (6,).
+def displace_pose(pose: Vector, error: Vector) -> Vector:
+    """Displace a pose (7,) by ``error`` (6,).
 
     The error is a displacement [m] and, about the axes of the pose, a rotation vector [rad].
     """

@@ -19,22 +19,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import CarryAndPut, slid
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.eyes import calibration
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
-from lerobot_env_bimanual.eyes.lens import Imperfections
-from lerobot_env_bimanual.eyes.recorder import CODECS, recording, row
+from lerobot_env_bimanual.eyes.recorder import CODECS, recording_of, rig_to_record, row
 from lerobot_env_bimanual.eyes.rig import Rig
 from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
 from lerobot_env_bimanual.so101 import BI_SO101, TASKS
 from lerobot_env_bimanual.so101.env import BiSo101Env
-from lerobot_env_bimanual.so101.expert import teleoperated
+from lerobot_env_bimanual.so101.expert import teleoperate
 from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
@@ -45,9 +44,9 @@ from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
 __all__ = [
     "CALIBRATION", "EXPERTS", "Expert", "demonstrate_forces", "expert", "main", "record",
+    "record_calibration",
 ]  # fmt: skip
 
-Vector = NDArray[np.float64]
 #: Time steps per second of the experts' motions, whatever the rate of the set.
 RATE = 100.0
 #: The task of showing tags to the cameras, and the first tag of the cube in each hand.
@@ -75,11 +74,11 @@ class Expert:
     environment: Callable[..., ControlledEnv]
     motion: Callable[[int], Demonstration] | None
     objects: tuple[str, ...]
-    actions: Callable[[Any, np.random.Generator], Iterable[Vector]] | None = None
+    actions: Callable[[Any, np.random.Generator], Iterable[Array]] | None = None
 
     def begin(
         self, env: ControlledEnv, rng: np.random.Generator
-    ) -> tuple[dict[str, Any], Iterable[Vector]]:
+    ) -> tuple[dict[str, Any], Iterable[Array]]:
         """Begin an episode: what is observed, and the actions."""
         motion = self.motion(int(rng.integers(2**31))) if self.motion else None
         start, seed = {} if motion is None else self.start(motion), int(rng.integers(2**31))
@@ -93,7 +92,7 @@ class Expert:
         return observation, np.stack(ways, axis=1)
 
     def start(self, motion: Demonstration) -> dict[str, Any]:
-        """The options with which an episode begins as a demonstration does."""
+        """Return the options with which an episode begins as a demonstration does."""
         start: dict[str, Any] = {"joints": motion.joints[0].numpy()}
         for name in self.objects:
             pose = motion.frame(name)
@@ -105,7 +104,7 @@ class Expert:
 
 
 def expert(task: str, robot: str = UPPER_BODY) -> Expert:
-    """The expert of a task by its name, and that of the robot.
+    """Find the expert of a task by its name, and that of the robot.
 
     Raises
     ------
@@ -134,7 +133,7 @@ ALONE = {
         lambda seed: CarryAndPut(rate=RATE).demonstrations(1, seed)[0],
         ("bottle", "tray"),
     ),
-    "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperated),
+    "cup_on_saucer": Expert(BiSo101Env, None, TASKS["cup_on_saucer"], teleoperate),
 }
 #: What can be recorded.
 EXPERTS = (*ALONE, *SUITE, *MORE)
@@ -151,12 +150,8 @@ def record(
     size: tuple[int, int] = (640, 480),
     robot: str = UPPER_BODY,
     codec: str = "av1",
-    imperfections: Imperfections | None = None,
     true_poses: bool = False,
     noise: float = 0.0,
-    hand: str = "r_hand",
-    offset_deg: float = 0.0,
-    noise_deg: float = 0.0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Path:
     """Let an environment follow the expert's motions, and record what its cameras see.
@@ -164,17 +159,14 @@ def record(
     ``observation.state`` is what was measured, ``action`` the reference for the end of each
     period. Demonstrations that do not succeed by the rules of the environment are not kept.
 
-    ``"calibration"`` is no task: the robot shows a cube of tags in its hand to the first camera
-    in varied postures, in one episode.
-
     Parameters
     ----------
     task : str
-        One of :data:`EXPERTS`, or ``"calibration"``.
+        One of :data:`EXPERTS`.
     out : str or Path
         The folder; it must not exist.
     n : int, default=10
-        How many episodes, or postures.
+        How many episodes.
     seed : int, default=0
         Of the demonstrations and of all noise.
     cameras : str or sequence of str, default="front"
@@ -184,21 +176,13 @@ def record(
     size : (int, int)
         Width and height of the pictures.
     robot : str, default="upper_body"
-        Who does a task of the suite, or is calibrated; ``"bi_so101"`` with both hands at once,
-        and its own offsets. Other tasks have a robot of their own.
+        Who does a task of the suite. Other tasks have a robot of their own.
     codec : {"av1", "h264", "pictures"}, default="av1"
-    imperfections : Imperfections, optional
-        What spoils the pictures.
+        How pictures are stored.
     true_poses : bool, default=False
         Whether the poses of the objects are recorded too, in ``observation.environment_state``.
     noise : float, default=0
         Of the sensors, as of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`.
-    hand : {"r_hand", "l_hand"}, default="r_hand"
-        That has the tags in a calibration.
-    offset_deg, noise_deg : float, default=0
-        Standard deviations of constant errors of the joints that move this hand, and of the
-        noise of each reading, in a calibration [deg]. The constant ones are ``joint_offsets``
-        of the cell file.
     progress : callable, optional
         Is given a line after each episode.
 
@@ -210,55 +194,94 @@ def record(
     Raises
     ------
     DataError, UnknownNameError
-        If the folder exists, an option is not one of the above, fewer demonstrations
-        succeed, or so few postures show the tags.
+        If the folder exists, an option is not one of the above, or fewer demonstrations
+        succeed.
     """
-    if n < 1:
-        raise DataError(f"at least one episode is recorded, got n={n}")
-    shows, rng = task == CALIBRATION, np.random.default_rng(seed)
-    if hand not in HANDS:
-        raise UnknownNameError("hand", hand, "the recorder", HANDS)
-    if shows and robot == BI_SO101:
-        chosen: dict[str, Any] = {"cameras": cameras, "fps": fps, "size": size, "codec": codec}
-        return record_waving(out, n=n, seed=seed, **chosen)
-    able = expert("lid" if shows else task, robot)
+    able = expert(task, robot)
     env = able.environment(fps=fps, noise=noise)
-    names, offsets, options = env.joint_names, np.zeros(len(env.joint_names)), dict[str, Any]()
-    if shows:
-        side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
-        cube = cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)
-        options = {"carriers": {**CHECK, hand: cube}, "objects": {}}
-    rig = env.rig(cameras, size, imperfections=imperfections, **options)
-    if not rig.views:
-        raise DataError("a set with videos needs a camera: --cameras front")
+    rig = rig_to_record(env, n, cameras, size)
     env.reset(seed=seed)
     cell = {**rig.content(), **env.cell_of_joints()}
-    if shows:
-        moved = calibration.chain_of(rig, hand)
-        offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
-        cell |= {"joint_offsets": {names[one]: float(offsets[one]) for one in moved}}
     settings: dict[str, Any] = {
         "objects": able.objects if true_poses else (),
         "robot_type": env.robot_type or robot,
-        "units": env.units,
+        "codec": codec,
     }
-    sizes = dict.fromkeys(rig.views, size)
-    called = [name + env.suffix for name in names]
-    with recording(out, fps, called, sizes, cell, codec=codec, **settings) as opened:
-        if shows:
-            postures = calibration.varied_postures(rig, hand, n, rng)
+    with recording_of(env, rig, out, cell, **settings) as opened:
+        _demonstrate(opened, able, env, rig, n, seed, true_poses, progress)
+    rig.close()
+    return Path(out)
 
-            def measured(joints: Vector) -> Vector:
-                noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
-                return np.asarray(joints - offsets + noise)
 
-            for one in calibration.calibration_episode(
-                rig, postures, fps, rng, measured, lambda joints: joints - offsets
-            ):
-                opened.add_frame(one)
-            opened.save_episode()
-        else:
-            _demonstrate(opened, able, env, rig, n, seed, true_poses, progress)
+def record_calibration(
+    out: str | Path,
+    *,
+    n: int = 10,
+    seed: int = 0,
+    cameras: str | Sequence[str] = "front",
+    fps: int = 25,
+    size: tuple[int, int] = (640, 480),
+    robot: str = UPPER_BODY,
+    codec: str = "av1",
+    hand: str = HANDS[1],
+    offset_deg: float = 0.0,
+    noise_deg: float = 0.0,
+) -> Path:
+    """Record one episode in which a robot shows a cube of tags in its hand to a camera.
+
+    Parameters
+    ----------
+    out, seed, cameras, fps, size, codec
+        As of :func:`record`.
+    n : int, default=10
+        How many postures.
+    robot : str, default="upper_body"
+        Who is calibrated; ``"bi_so101"`` with both hands at once, and its own offsets.
+    hand : {"r_hand", "l_hand"}, default="r_hand"
+        The one that has the tags.
+    offset_deg, noise_deg : float, default=0
+        Standard deviations of constant errors of the joints that move this hand, and of the
+        noise of each reading [deg]. The constant ones are ``joint_offsets`` of the cell file.
+
+    Returns
+    -------
+    Path
+        The folder, with the true ``cell.json`` in it.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the folder exists, an option is not one of the above, or so few postures show the
+        tags.
+    """
+    if hand not in HANDS:
+        raise UnknownNameError("hand", hand, "the recorder", HANDS)
+    if robot == BI_SO101:
+        return record_waving(
+            out, n=n, seed=seed, cameras=cameras, fps=fps, size=size, codec=codec
+        )
+    env, rng = expert("lid", robot).environment(fps=fps), np.random.default_rng(seed)
+    side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
+    cube = cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)
+    rig = rig_to_record(env, n, cameras, size, carriers={**CHECK, hand: cube}, objects={})
+    env.reset(seed=seed)
+    offsets, moved = np.zeros(len(env.joint_names)), calibration.chain_of(rig, hand)
+    offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
+    cell = {**rig.content(), **env.cell_of_joints()}
+    cell |= {"joint_offsets": {env.joint_names[i]: float(offsets[i]) for i in moved}}
+    postures = calibration.varied_postures(rig, hand, n, rng)
+
+    def measure(joints: Array) -> Array:
+        noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
+        return np.asarray(joints - offsets + noise)
+
+    settings = {"robot_type": env.robot_type or robot, "codec": codec}
+    with recording_of(env, rig, out, cell, **settings) as opened:
+        for frame in calibration.calibration_episode(
+            rig, postures, fps, rng, measure, lambda joints: joints - offsets
+        ):
+            opened.add_frame(frame)
+        opened.save_episode()
     rig.close()
     return Path(out)
 
@@ -346,7 +369,7 @@ def demonstrate_forces(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(
         prog="python -m lerobot_env_bimanual.record",
         description="Record demonstrations with cameras as a LeRobot data set with videos.",
@@ -373,11 +396,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     task, given["size"] = given["task"], tuple(given["size"])
     others = ("noise", "true_poses"), ("hand", "offset_deg", "noise_deg")
     for name in others[task != CALIBRATION]:
-        if given[name] != parser.get_default(name):
+        if given.pop(name) != parser.get_default(name):
             parser.error(f"--{name.replace('_', '-')} is no option of the task {task}")
     _report_errors_alone()
     try:
-        record(**given, progress=partial(print, file=sys.stderr, flush=True))
+        if task == CALIBRATION:
+            del given["task"]
+            record_calibration(**given)
+        else:
+            record(**given, progress=partial(print, file=sys.stderr, flush=True))
     except TPGMMError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -85,7 +85,7 @@ class Renderer:
         self._view = mujoco.MjrRect(0, 0, width, height)
 
     def __call__(self, data: mujoco.MjData, camera: str | None = None) -> NDArray[np.uint8]:
-        """A picture (height, width, 3), black and small where nothing can be drawn.
+        """Draw a picture (height, width, 3), black and small where nothing can be drawn.
 
         Parameters
         ----------

@@ -15,8 +15,21 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "BOX", "CAMERA", "CYLINDER", "DAMPING", "PALM", "PALM_SIZE", "STIFFNESS", "TABLE",
-    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_view", "add_weld", "controlled",
+    "BOX",
+    "CAMERA",
+    "CYLINDER",
+    "DAMPING",
+    "PALM",
+    "PALM_SIZE",
+    "STIFFNESS",
+    "TABLE",
+    "TIMESTEP",
+    "RobotScene",
+    "add_geom",
+    "add_position_control",
+    "add_table",
+    "add_view",
+    "add_weld",
     "robot_spec",
 ]  # fmt: skip
 
@@ -38,17 +51,17 @@ PALM_SIZE = (0.025, 0.01, 0.04)
 
 
 def robot_spec() -> mujoco.MjSpec:
-    """The upper body alone, with a light and a camera before it.
+    """Specify the upper body alone, with a light and a camera before it.
 
     Returns
     -------
     mujoco.MjSpec
-        As :func:`controlled` gives it, the joints in the URDF's order.
+        As :func:`add_position_control` gives it, the joints in the URDF's order.
     """
-    return controlled(mujoco.MjSpec.from_string(upper_body_urdf()))
+    return add_position_control(mujoco.MjSpec.from_string(upper_body_urdf()))
 
 
-def controlled(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpec:
+def add_position_control(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpec:
     """Give a robot position control, palms, a light and a camera before it.
 
     Parameters
@@ -123,7 +136,7 @@ class RobotScene(ABC):
     Parameters
     ----------
     spec : mujoco.MjSpec
-        That of :func:`controlled`, with more in it.
+        That of :func:`add_position_control`, with more in it.
 
     Attributes
     ----------
@@ -152,7 +165,7 @@ class RobotScene(ABC):
 
     @abstractmethod
     def snapshot(self) -> Any:
-        """The state without velocities."""
+        """Return the state without velocities."""
 
     @abstractmethod
     def restore(self, snapshot: Any) -> None:
@@ -218,7 +231,7 @@ class RobotScene(ABC):
         data.eq_active[weld] = True
 
     def _contact_force(self, index: int, first: bool) -> NDArray[np.float64]:
-        """Of a contact's first or second geom on the other, friction too, shape (3,) [N]."""
+        """Compute the force of a contact's geom on the other one, shape (3,) [N]."""
         force, frame = np.empty(6), self.data.contact.frame[index].reshape(3, 3)
         mujoco.mj_contactForce(self.model, self.data, index, force)
         # it is what the first geom does to the second, in the contact's frame

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lerobot_env_bimanual.base import finite_vector
+from lerobot_env_bimanual.base import Array, finite_vector
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError
 
@@ -49,16 +48,16 @@ class Start:
         How far the bottle slides [m] and turns [rad] in the hands while they close.
     """
 
-    joints: NDArray[np.float64]
-    poses: Mapping[str, NDArray[np.float64]]
+    joints: Array
+    poses: Mapping[str, Array]
     delay: int
     pushed: int
     push_start: float
     push_length: float
     push_torque: float
-    misperception: NDArray[np.float64]
+    misperception: Array
     mass: float = 1.0
-    slide: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    slide: Array = field(default_factory=lambda: np.zeros(2))
 
     @staticmethod
     def drawn(rng: np.random.Generator, robot: Robot, objects: int = 1) -> dict[str, Any]:
@@ -101,8 +100,8 @@ class Start:
                 )
         return replace(self, joints=joints, poses=chosen, slide=slide)
 
-    def torques(self, start: int, steps: int) -> NDArray[np.float64]:
-        """The push, as torques (steps, n_joints) [N m], one for each millisecond."""
+    def torques(self, start: int, steps: int) -> Array:
+        """Return the push as torques (steps, n_joints) [N m], one for each millisecond."""
         torques = np.zeros((steps, len(self.joints)))
         first = round(1000 * self.push_start) - start
         last = first + round(1000 * self.push_length)

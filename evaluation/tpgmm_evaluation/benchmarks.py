@@ -83,7 +83,7 @@ class Benchmark(ABC):
     @property
     def criteria(self) -> dict[str, Figure]:
         """The figures on which a success depends."""
-        return {name: figure for name, figure in self.figures.items() if figure.limited}
+        return {name: figure for name, figure in self.figures.items() if figure.has_limit}
 
     @property
     def all_conditions(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from lerobot_env_bimanual.disturbances import (
     PoseLost,
     StartedMidway,
     Stopped,
-    displaced,
+    displace_pose,
     generators,
     parse_condition,
 )
@@ -32,7 +32,7 @@ def anywhere(_step):
 
 
 def drawn(disturbance, seed):
-    return disturbance.drawn(np.random.default_rng(seed), COURSE, anywhere)
+    return disturbance.draw(np.random.default_rng(seed), COURSE, anywhere)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_moments_are_drawn_from_the_seed_whatever_else_happens(text):
         assert after == np.random.default_rng(seed).random()
         found = {}
         for part, own in zip(parts, rngs, strict=True):
-            part = part.drawn(own, COURSE, anywhere)
+            part = part.draw(own, COURSE, anywhere)
             found[type(part).__name__] = getattr(part, "moment", None)
         return found
 
@@ -119,14 +119,16 @@ def test_a_shove_leaves_a_past_and_enough_future():
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
 def test_an_object_is_moved_to_a_place_that_is_meant(seconds):
     for seed in range(50):
-        part = Moved(seconds=seconds).drawn(
-            np.random.default_rng(seed), COURSE, lambda step: displaced(POSE, step)[0] <= 0.31
+        part = Moved(seconds=seconds).draw(
+            np.random.default_rng(seed),
+            COURSE,
+            lambda step: displace_pose(POSE, step)[0] <= 0.31,
         )
         end = part.moment + seconds
         assert end <= COURSE.grasp - 1.5 + 1e-12
         assert part.displacement(part.moment - 1e-3) is None
         assert part.displacement(end + 0.2) is None
-        moved = displaced(POSE, part.displacement(end + 1e-6))
+        moved = displace_pose(POSE, part.displacement(end + 1e-6))
         assert moved[0] <= 0.31
         assert np.linalg.norm(moved[:3] - POSE[:3]) == pytest.approx(0.04)
         assert 2 * np.degrees(abs(np.arctan2(moved[6], moved[3]))) == pytest.approx(20)
@@ -137,8 +139,8 @@ def test_an_object_is_moved_to_a_place_that_is_meant(seconds):
 
 def test_noise_has_its_sizes_about_each_axis_and_differs_from_tick_to_tick():
     rng = np.random.default_rng(0)
-    poses = np.concatenate((POSE, displaced(POSE, np.array([0.1, 0, 0, 0, 0, 0.5]))))
-    seen = np.array([NoisyPose().seen(poses, poses, 0.0, rng) for _ in range(4000)])
+    poses = np.concatenate((POSE, displace_pose(POSE, np.array([0.1, 0, 0, 0, 0, 0.5]))))
+    seen = np.array([NoisyPose().observe(poses, poses, 0.0, rng) for _ in range(4000)])
     assert np.std(seen[:, [0, 1, 2, 7, 8, 9]], axis=0) == pytest.approx(0.005, rel=0.06)
     turns = 2 * np.degrees(seen[:, 4:7])  # small, from no rotation
     assert np.std(turns, axis=0) == pytest.approx(2.0, rel=0.06)
@@ -146,12 +148,12 @@ def test_noise_has_its_sizes_about_each_axis_and_differs_from_tick_to_tick():
 
 
 def test_a_bias_is_one_of_each_object_and_stays_for_the_episode():
-    poses = np.concatenate((POSE, displaced(POSE, np.array([0.1, 0, 0, 0, 0, 0.5]))))
+    poses = np.concatenate((POSE, displace_pose(POSE, np.array([0.1, 0, 0, 0, 0, 0.5]))))
     errors = []
     for seed in range(30):
         part = drawn(Biased(), seed)
-        error = part.seen(poses, poses, 0.0, None) - poses
-        np.testing.assert_array_equal(part.seen(poses, poses, 9.0, None) - poses, error)
+        error = part.observe(poses, poses, 0.0, None) - poses
+        np.testing.assert_array_equal(part.observe(poses, poses, 9.0, None) - poses, error)
         errors += error.reshape(2, 7).tolist()
     errors = np.array(errors)
     assert np.linalg.norm(errors[:, :3], axis=1) == pytest.approx(0.005)
@@ -165,9 +167,9 @@ def test_a_bias_is_one_of_each_object_and_stays_for_the_episode():
 def test_a_lost_pose_is_nan_or_repeated(stale):
     part, last = PoseLost(0.5, stale, moment=2.0), POSE + 0.1
     for time in (1.99, 2.5):
-        np.testing.assert_array_equal(part.seen(POSE, last, time, None), POSE)
+        np.testing.assert_array_equal(part.observe(POSE, last, time, None), POSE)
     for time in (2.0, 2.49):
-        lost = part.seen(POSE, last, time, None)
+        lost = part.observe(POSE, last, time, None)
         np.testing.assert_array_equal(lost, last if stale else np.full(7, math.nan))
 
 
@@ -183,7 +185,7 @@ def test_ticks_come_early_and_late_and_some_not_at_all():
 def test_a_displaced_pose():
     half = np.sqrt(0.5)
     pose = np.array([1.0, 2.0, 3.0, half, 0, 0, half])
-    out = displaced(pose, np.array([0.1, 0, 0, np.pi / 2, 0, 0]))
+    out = displace_pose(pose, np.array([0.1, 0, 0, np.pi / 2, 0, 0]))
     # a quarter about the pose's own x axis, after a quarter about z
     np.testing.assert_allclose(out, [1.1, 2, 3, 0.5, 0.5, 0.5, 0.5], atol=1e-12)
     assert pose[0] == 1

@@ -138,11 +138,11 @@ def bottles(change):
     return lambda item: replace(item, frames={"bottle": change(item.frames["bottle"])})
 
 
-def scaled(factor):
+def scale_bottle(factor):
     return bottles(lambda frame: Frame(frame.position * factor, frame.orientation))
 
 
-def moved(*shift):
+def move_bottle(*shift):
     shift = torch.tensor(shift, dtype=torch.float64)
     return bottles(lambda frame: Frame(frame.position + shift, frame.orientation))
 
@@ -151,15 +151,15 @@ def as_xyzw(frame):
     return Frame(frame.position, frame.orientation.roll(-1, dims=-1))
 
 
-def timed(change):
+def change_time(change):
     return lambda item: replace(item, time=change(item.time))
 
 
-def unnamed(order):
+def drop_names(order):
     return lambda item: replace(item, joints=item.joints[:, order], joint_names=None)
 
 
-def stored(folder, **options):
+def write_set(folder, **options):
     """A small LeRobot set, of which the units are not declared."""
     root = folder / "set"
     sets.write(root, **options)
@@ -167,7 +167,7 @@ def stored(folder, **options):
     return root
 
 
-def multiplied(root, factors):
+def multiply_state(root, factors):
     change = lambda values: values * factors  # noqa: E731
     sets.change_table(
         root, sets.DATA, lambda t: sets.set_column(t, "observation.state", change)
@@ -205,12 +205,12 @@ def joints_in_ticks(_):
 
 @mistake("units", r"units: .*'bottle'.*millimetres")
 def bottle_in_millimetres(_):
-    learn(each(scaled(1000.0)))
+    learn(each(scale_bottle(1000.0)))
 
 
 @mistake("units", r"units: .*'bottle'.*centimetres")
 def bottle_in_centimetres(_):
-    learn(each(scaled(100.0)))
+    learn(each(scale_bottle(100.0)))
 
 
 @mistake("units", r"units: .*millimetres")
@@ -238,28 +238,28 @@ def start_posture_in_degrees(_):
 
 @mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
 def new_bottle_in_millimetres(_):
-    predict(scaled(1000.0)(usual()))
+    predict(scale_bottle(1000.0)(usual()))
 
 
 @mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
 def new_bottle_in_centimetres(_):
-    predict(scaled(100.0)(usual()))
+    predict(scale_bottle(100.0)(usual()))
 
 
 @mistake("units", r"not radians: .*'left_elbow'.*'right_elbow'")
 def a_set_in_degrees(folder):
-    load_lerobot(multiplied(stored(folder), 600.0))
+    load_lerobot(multiply_state(write_set(folder), 600.0))
 
 
 @mistake("units", r"(not radians|undecided).*right_elbow")
 def a_set_in_degrees_of_which_one_joint_is_quiet(folder):
-    root = multiplied(stored(folder), [100.0, 1.0, 1.0])
+    root = multiply_state(write_set(folder), [100.0, 1.0, 1.0])
     load_lerobot(root, units={"left_elbow": "deg"})
 
 
 @mistake("units", r"(not radians|undecided).*right_elbow")
 def a_calibrated_set_of_which_one_joint_is_quiet(folder):
-    root = multiplied(stored(folder), [100.0, 1.0, 1.0])
+    root = multiply_state(write_set(folder), [100.0, 1.0, 1.0])
     load_lerobot(root, units={"left_elbow": Scale.from_calibration(1000, 3000)})
 
 
@@ -274,7 +274,7 @@ def the_quiet_episodes_of_a_set_in_degrees(folder):
 
 @mistake("units", r"unit 'degree' is unknown")
 def a_misspelt_unit(folder):
-    load_lerobot(stored(folder), units="degree")
+    load_lerobot(write_set(folder), units="degree")
 
 
 @mistake("units", r"units: .*millimetres")
@@ -292,12 +292,12 @@ def a_set_with_its_bottle_in_millimetres(folder):
 
 @mistake("time", r"time: .*milliseconds")
 def time_in_milliseconds(_):
-    learn(each(timed(lambda time: 1000 * time)))
+    learn(each(change_time(lambda time: 1000 * time)))
 
 
 @mistake("time", r"time: .*numbers of frames")
 def frame_numbers_for_time(_):
-    learn(each(timed(lambda time: torch.arange(len(time), dtype=torch.float64))))
+    learn(each(change_time(lambda time: torch.arange(len(time), dtype=torch.float64))))
 
 
 @mistake("time", r"time: .*another unit")
@@ -307,27 +307,27 @@ def time_in_days(_):
 
 @mistake("time", r"speed: .*faster than the robot")
 def time_in_minutes(_):
-    lint(each(timed(lambda time: time / 60)))
+    lint(each(change_time(lambda time: time / 60)))
 
 
 @mistake("time", r"(time|durations|alignment): ")
 def one_recording_in_milliseconds(_):
-    learn(one(timed(lambda time: 1000 * time)))
+    learn(one(change_time(lambda time: 1000 * time)))
 
 
 @mistake("time", r"alignment: .*begin at different times")
 def clocks_that_do_not_begin_together(_):
-    learn([timed(lambda t, n=n: t + 30.0 * n)(item) for n, item in enumerate(shown())])
+    learn([change_time(lambda t, n=n: t + 30.0 * n)(item) for n, item in enumerate(shown())])
 
 
 @mistake("time", r"time must increase strictly")
 def time_that_goes_back(_):
-    one(timed(lambda time: time.flip(0)))
+    one(change_time(lambda time: time.flip(0)))
 
 
 @mistake("time", r"time must increase strictly")
 def a_time_twice(_):
-    one(timed(lambda time: torch.cat((time[:5], time[4:-1]))))
+    one(change_time(lambda time: torch.cat((time[:5], time[4:-1]))))
 
 
 @mistake("time", r"gaps: nothing was recorded for")
@@ -360,7 +360,7 @@ def an_event_in_milliseconds(_):
 
 @mistake("lengths", r"alignment: .*last from")
 def unequal_lengths_without_alignment(_):
-    learn([timed(lambda t, n=n: t * (1 + n / 20))(d) for n, d in enumerate(shown())])
+    learn([change_time(lambda t, n=n: t * (1 + n / 20))(d) for n, d in enumerate(shown())])
 
 
 @mistake("lengths", r"freedom: one demonstration")
@@ -380,7 +380,7 @@ def copies_of_one_demonstration(_):
 
 @mistake("lengths", r"durations: .*demonstration 2")
 def a_recording_that_ran_on(_):
-    lint(one(timed(lambda time: 4 * time)))
+    lint(one(change_time(lambda time: 4 * time)))
 
 
 @mistake("lengths", r"joints has shape \(T, n_joints\) with T")
@@ -409,12 +409,12 @@ def a_demonstration_that_is_no_list(_):
 @mistake("order", r"order: the joints are unnamed.*limits")
 def unnamed_joints_arms_exchanged(_):
     order = [0, 1, 2, *range(10, 17), *range(3, 10)]
-    lint(each(unnamed(order)))
+    lint(each(drop_names(order)))
 
 
 @mistake("order", r"(order|limits): .*limits")
 def unnamed_joints_reversed(_):
-    lint(each(unnamed(list(range(16, -1, -1)))))
+    lint(each(drop_names(list(range(16, -1, -1)))))
 
 
 @mistake("order", r"(order|limits|episodes): ")
@@ -437,7 +437,7 @@ def joints_transposed(_):
 @mistake("order", r"frames: frame 'bottle'.*demonstration 2")
 def x_and_z_exchanged_in_one_demonstration(_):
     flip = bottles(lambda f: Frame(f.position.flip(0) + f.position.new_tensor([0, 0, 0]), None))
-    lint(one(lambda d: flip(moved(0.0, 0.0, 0.0)(scaled(3.0)(d)))))
+    lint(one(lambda d: flip(move_bottle(0.0, 0.0, 0.0)(scale_bottle(3.0)(d)))))
 
 
 @mistake("order", r"place: bottle")
@@ -530,7 +530,7 @@ def a_frame_at_an_event_that_is_not_there(folder):
     load_lerobot(root, robot=robot, frames={"cup": LinkPose("hand", "touch")})
 
 
-def named(root, names):
+def name_values(root, names):
     sets.change_info(root, lambda i: i["features"]["observation.state"].update(names=names))
     sets.change_table(root, sets.DATA, lambda table: table)
     return root
@@ -541,27 +541,29 @@ ARM = sets.Arm("left_elbow", "right_elbow", "gripper")
 
 @mistake("names", r"'gripper' is there twice.*--joint-name")
 def a_set_that_names_two_values_alike(folder):
-    load_lerobot(named(stored(folder), ["left_elbow", "gripper", "gripper"]), robot=ARM)
+    load_lerobot(
+        name_values(write_set(folder), ["left_elbow", "gripper", "gripper"]), robot=ARM
+    )
 
 
 @mistake("names", r"2 names for 3 values.*--joint-name")
 def a_set_that_names_too_few_values(folder):
-    load_lerobot(named(stored(folder), ["left_elbow", "right_elbow"]), robot=ARM)
+    load_lerobot(name_values(write_set(folder), ["left_elbow", "right_elbow"]), robot=ARM)
 
 
 @mistake("names", r"0 is no name.*--joint-name")
 def a_set_with_numbers_for_names(folder):
-    load_lerobot(named(stored(folder), {"motors": [0, 1, 2]}), robot=ARM)
+    load_lerobot(name_values(write_set(folder), {"motors": [0, 1, 2]}), robot=ARM)
 
 
 @mistake("names", r"does not name its 3 values.*--joint-name robot")
 def a_set_without_names(folder):
-    load_lerobot(named(stored(folder), None), robot=ARM)
+    load_lerobot(name_values(write_set(folder), None), robot=ARM)
 
 
 @mistake("names", r"joints: 'action' is read.*measured_joints.*--joints")
 def measured_joints_under_another_name(folder):
-    root, name = stored(folder), "measured_joints"
+    root, name = write_set(folder), "measured_joints"
     sets.change_table(
         root,
         sets.DATA,
@@ -632,12 +634,12 @@ def columns_of_a_pose_one_off(folder):
 
 @mistake("frames", r"frames: .*demonstration 2 \(0, 0, 0\)")
 def a_tracker_that_lost_the_bottle(_):
-    lint(one(scaled(0.0)))
+    lint(one(scale_bottle(0.0)))
 
 
 @mistake("frames", r"frames: .*demonstration 2")
 def another_base_in_one_demonstration(_):
-    lint(one(moved(0.0, 0.8, 0.0)))
+    lint(one(move_bottle(0.0, 0.8, 0.0)))
 
 
 @mistake("frames", r"frames: frame 'bottle' jumps .*demonstration 2")
@@ -671,7 +673,7 @@ def a_bottle_that_is_nowhere(_):
 @mistake("frames", r"place: bottle: y = 1")
 def a_tick_with_the_bottle_elsewhere(_):
     model = bottle_model(4, tol=1e6).fit(shown())
-    model.step(1.0, usual().joints, moved(0.0, 1.0, 0.0)(usual()).frames)
+    model.step(1.0, usual().joints, move_bottle(0.0, 1.0, 0.0)(usual()).frames)
 
 
 # -- measured poses ------------------------------------------------------------------------
@@ -903,7 +905,7 @@ def a_file_for_a_robot(_):
 
 @mistake("shapes", r"got 'arm\.urdf'; .*Robot\.from_urdf")
 def a_file_for_the_robot_of_a_set(folder):
-    load_lerobot(stored(folder), robot="arm.urdf")
+    load_lerobot(write_set(folder), robot="arm.urdf")
 
 
 # -- files ---------------------------------------------------------------------------------
@@ -981,7 +983,7 @@ def a_folder_that_is_no_set(folder):
 
 @mistake("files", r"file-000\.parquet")
 def a_file_that_is_cut_off(folder):
-    root = stored(folder)
+    root = write_set(folder)
     path = root / sets.DATA
     path.write_bytes(path.read_bytes()[:-500])
     load_lerobot(root)
@@ -989,28 +991,28 @@ def a_file_that_is_cut_off(folder):
 
 @mistake("files", r"file-000\.parquet.*(missing|absent|not there|does not exist)")
 def a_file_that_is_missing(folder):
-    root = stored(folder)
+    root = write_set(folder)
     (root / sets.DATA).unlink()
     load_lerobot(root)
 
 
 @mistake("files", r"NaN")
 def a_column_with_holes(folder):
-    root = stored(folder)
+    root = write_set(folder)
     sets.in_data("observation.state", sets.spoil(4, 1, math.nan))(root)
     load_lerobot(root)
 
 
 @mistake("files", r"increase|time")
 def rows_of_one_time(folder):
-    root = stored(folder)
+    root = write_set(folder)
     sets.in_data("timestamp", sets.stuck)(root)
     load_lerobot(root)
 
 
 @mistake("files", r"joints=")
 def a_set_without_a_state(folder):
-    root = stored(folder)
+    root = write_set(folder)
 
     def rename(info):
         info["features"]["poses"] = info["features"].pop("observation.state")
@@ -1065,7 +1067,7 @@ def written_arms(folder, change=lambda item: item):
     return root
 
 
-def recorded(folder, change=lambda item: item, **options):
+def load_arms(folder, change=lambda item: item, **options):
     root = written_arms(folder, change)
     robot = options.pop("robot", "bi_so101")
     return load_lerobot(root, robot=parse_robot(robot), **options)
@@ -1073,22 +1075,22 @@ def recorded(folder, change=lambda item: item, **options):
 
 @mistake("units", r"not radians.*'lerobot'")
 def arms_in_lerobots_units_that_nobody_said(folder):
-    recorded(folder)
+    load_arms(folder)
 
 
 @mistake("units", r"'left_gripper.pos' goes from .* normalised to 0 \.\.\. 100.*degrees")
 def grippers_beyond_their_hundred(folder):
-    recorded(folder, joints(1.6, 5), units="lerobot")
+    load_arms(folder, joints(1.6, 5), units="lerobot")
 
 
 @mistake("units", r"units: .*cannot be: 'left_gripper' .*'raw'.*unlimited.*'lerobot'")
 def raw_grippers_of_a_robot_with_limits(folder):
-    recorded(folder, units={"*": "deg", "*gripper": "raw"})
+    load_arms(folder, units={"*": "deg", "*gripper": "raw"})
 
 
 @mistake("units", r"units names \['\*griper'\], which fit no value")
 def a_pattern_that_is_misspelt(folder):
-    recorded(folder, units={"*": "deg", "*griper": "raw"})
+    load_arms(folder, units={"*": "deg", "*griper": "raw"})
 
 
 @mistake("robots", r"20 m apart: are poses in metres, or in centimetres")
@@ -1103,12 +1105,12 @@ def cups_at(place):
 @mistake("robots", r"distance: .*'cup'.*frame of 'left_base_link', one would come to 0.00 m")
 def poses_seen_from_the_left_arm(folder):
     seen = cups_at(lambda at: at - torch.tensor([0, 0.2, 0]))
-    recorded(folder, seen, robot="left=so101@0,2,0;right=so101@0,-1,0", units="lerobot")
+    load_arms(folder, seen, robot="left=so101@0,2,0;right=so101@0,-1,0", units="lerobot")
 
 
 @mistake("robots", r"distance: none of the links .* nearer than 1.\d\d m to one of .*'cup'")
 def an_object_that_no_hand_comes_near(folder):
-    recorded(folder, cups_at(lambda _: [2.0, 1.0, 0.0]), units="lerobot")
+    load_arms(folder, cups_at(lambda _: [2.0, 1.0, 0.0]), units="lerobot")
 
 
 @mistake("robots", r"the pose of 'left' is a Frame, x y z in metres")

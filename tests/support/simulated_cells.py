@@ -165,21 +165,6 @@ def so101_cell(offset: float, rng: np.random.Generator, **settings: Any) -> Simu
     )  # fmt: skip
 
 
-def upper_body_cell(offset: float, rng: np.random.Generator, **settings: Any) -> SimulatedCell:
-    """The upper body with a cube in its right hand before one camera."""
-    from tpgmm_datasets.bottle.skill import BottleShaking
-
-    robot = robot_named("upper_body")
-    middle = BottleShaking().neutral_posture().numpy()
-    moving = robot.state(torch.as_tensor(middle)).jacobians[0].abs().amax(0).numpy() > 1e-9
-    return SimulatedCell(
-        robot, {"front": (looking((1.05, -0.35, 0.65), (0.3, -0.1, 0.2)), None)},
-        {"cube": (LARGE, rigid(np.radians([10, 20, 30]), (0.03, -0.04, 0.05)), "r_hand")},
-        np.radians(rng.normal(0, offset, robot.n_joints)) * moving,
-        middle=middle, reach=0.6 * moving, **settings,
-    )  # fmt: skip
-
-
 def wrist_cell(offset: float, rng: np.random.Generator, **settings: Any) -> SimulatedCell:
     """An SO-101 whose camera on the gripper sees a cube that stands still on the table."""
     cell = so101_cell(offset, rng, **settings)

@@ -26,7 +26,7 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 __all__ = ["AlohaExpert", "WayPoint"]
 
 
-def _turned(quaternion: Tensor, **axes: float) -> Tensor:
+def _turn_about(quaternion: Tensor, **axes: float) -> Tensor:
     """Turn on about axes of the body, given in degrees."""
     for axis, angle in axes.items():
         vector = math.radians(angle) * torch.eye(3, dtype=torch.float64)["xyz".index(axis)]
@@ -35,9 +35,9 @@ def _turned(quaternion: Tensor, **axes: float) -> Tensor:
 
 
 LEFT = quaternions.identity()  # the left gripper looks along the world's x axis
-RIGHT = _turned(LEFT, z=180)
-LEFT_ROLLED = _turned(LEFT, x=90)  # fingers above one another
-LEFT_DOWN, RIGHT_DOWN = _turned(LEFT, y=90), _turned(RIGHT, y=90)
+RIGHT = _turn_about(LEFT, z=180)
+LEFT_ROLLED = _turn_about(LEFT, x=90)  # fingers above one another
+LEFT_DOWN, RIGHT_DOWN = _turn_about(LEFT, y=90), _turn_about(RIGHT, y=90)
 
 #: Height of each object's centre when it rests on the table [m].
 RESTING = {"cube": 0.02, "peg": 0.01, "socket": 0.022}
@@ -146,7 +146,7 @@ class AlohaExpert:
             raise UnknownNameError("task", self.task, "the expert", PLANS)
 
     def plan(self, agent_pos: Any, environment_state: Any) -> NDArray[np.float64]:
-        """The references that follow on a first observation.
+        """Plan the references that follow on a first observation.
 
         Parameters
         ----------
@@ -248,7 +248,7 @@ class AlohaExpert:
 
 
 def _lying(name: str, pose: Tensor) -> Frame:
-    """An object's frame as it comes to rest, turned to the nearest of its equal looks."""
+    """Return an object's frame at rest, turned to the nearest of its equal looks."""
     _, _, _, w, x, y, z = pose.unbind(-1)
     yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     half = (yaw - SYMMETRY[name] * torch.round(yaw / SYMMETRY[name])) / 2
@@ -261,7 +261,7 @@ def _lying(name: str, pose: Tensor) -> Frame:
 
 
 def _pose(point: WayPoint, frames: dict[str, Frame]) -> Frame:
-    """The pose of a way point in the world, one for each situation."""
+    """Return the pose of a way point in the world, one for each situation."""
     some = next(iter(frames.values()))
     frame = (
         Frame(torch.zeros_like(some.position)) if point.frame is None else frames[point.frame]

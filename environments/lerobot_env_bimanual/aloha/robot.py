@@ -37,7 +37,7 @@ PINCH_POINT = (0.14, 0.0, 0.0)
 
 
 def aloha_operators(task: str, orientation: bool = True) -> list[Operator]:
-    """The subspaces of a task: each gripper seen from an object, and the joints.
+    """List the subspaces of a task: each gripper seen from an object, and the joints.
 
     Where peg and socket meet, also one gripper seen from the other.
 
@@ -71,7 +71,7 @@ def aloha_operators(task: str, orientation: bool = True) -> list[Operator]:
 
 
 def aloha_robot(**options: Any) -> Robot:
-    """The two arms, with the points between the fingers as links.
+    """Build the two arms, with the points between the fingers as links.
 
     Parameters
     ----------

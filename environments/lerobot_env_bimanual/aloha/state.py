@@ -15,10 +15,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lerobot_env_bimanual.aloha.robot import ARM_JOINTS, HOW_TO_INSTALL, JOINTS, OBJECTS, SIDES
-from lerobot_env_bimanual.base import Observation, StateEnv, finite_vector
+from lerobot_env_bimanual.base import Array, Observation, StateEnv, finite_vector
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
 __all__ = ["AlohaStateEnv"]
@@ -210,7 +210,7 @@ class AlohaStateEnv(StateEnv):
     def _simulation(self) -> tuple[Any, Any]:
         return self._physics.model.ptr, self._physics.data.ptr
 
-    def _sample(self, seed: int | None) -> NDArray[np.float64]:
+    def _sample(self, seed: int | None) -> Array:
         """gym-aloha's poses for a seed, turned about the vertical."""
         drawn = int(self.np_random.integers(2**32)) if seed is None else seed % 2**32
         poses = np.ravel(self._draw(drawn))
@@ -221,7 +221,7 @@ class AlohaStateEnv(StateEnv):
         return poses
 
     def _height(self) -> float:
-        """Of the cube or the peg [m]."""
+        """Return the height of the cube or the peg [m]."""
         return float(self._rules.get_env_state(self._physics)[2])
 
     def _observation(self) -> Observation:

@@ -82,14 +82,14 @@ class CarryAndPut(BottleSkill):
     turn: float = 10.0
 
     def tray_poses(self, bottles: Frame, rng: np.random.Generator) -> Frame:
-        """A tray for each bottle (n,), anywhere on the right of its table."""
+        """Draw a tray for each bottle (n,), anywhere on the right of its table."""
         (x, y, _), (far, wide, _) = self.lowest, self.highest
         trays = upright(rng, (x, -wide, 0.0), (far, -y, 0.0), self.yaw, len(bottles.position))
         trays.position[:, 2] = bottles.position[:, 2] - FOOT
         return trays
 
     def slides(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        """How far bottles slide [m] and turn [rad] in the hands, shape (n, 2)."""
+        """Draw how far bottles slide [m] and turn [rad] in the hands, shape (n, 2)."""
         most = self.slide, math.radians(self.turn)
         return rng.uniform(-1, 1, (n, 2)) * most
 
@@ -133,7 +133,7 @@ class CarryAndPut(BottleSkill):
     def nominal(
         self, situations: Sequence[Situation], slides: NDArray[np.float64] | None = None
     ) -> list[Demonstration]:
-        """The skill in given situations, without its spread in timing.
+        """Perform the skill in given situations, without its spread in timing.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class CarryAndPut(BottleSkill):
         return self._demonstrations(situations, slides, self._timing.nominal_ends(n))
 
     def put_error(self, bottle: Frame, tray: Frame) -> tuple[Tensor, Tensor]:
-        """How far a bottle is from its place on a tray.
+        """Measure how far a bottle is from its place on a tray.
 
         Returns
         -------
@@ -198,7 +198,7 @@ class CarryAndPut(BottleSkill):
 
 
 def slide(slides: NDArray[np.float64]) -> Frame:
-    """The bottle, seen from where it stood before it slid and turned by (..., 2) [m, rad]."""
+    """Return the bottle's pose seen from where it stood before it slid by (..., 2) [m, rad]."""
     given = torch.as_tensor(slides, dtype=torch.float64)
     zero = torch.zeros_like(given[..., 0])
     half = given[..., 1] / 2
@@ -209,7 +209,7 @@ def slide(slides: NDArray[np.float64]) -> Frame:
 
 
 def slid(demonstration: Demonstration) -> NDArray[np.float64]:
-    """How far the bottle of a demonstration slides [m] and turns [rad], shape (2,)."""
+    """Measure how far the bottle of a demonstration slides [m] and turns [rad], shape (2,)."""
     bottle, time = demonstration.frame("bottle"), demonstration.time
     grasped = bottle[int(torch.searchsorted(time, demonstration.events["grasp"]))]
     turn = quaternions.product(
@@ -220,7 +220,7 @@ def slid(demonstration: Demonstration) -> NDArray[np.float64]:
 
 
 def before_sliding(bottle: Frame, slides: NDArray[np.float64]) -> Frame:
-    """Where a bottle that has slid would be in the same hands if it had not."""
+    """Return where a bottle that has slid would be in the same hands if it had not."""
     slid = slide(slides)
     turn = quaternions.product(bottle.orientation, quaternions.conjugate(slid.orientation))
     return Frame(bottle.position - quaternions.rotate(turn, slid.position), turn)

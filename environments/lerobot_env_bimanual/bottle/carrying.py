@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import SLIDE, TASK, CarryAndPut, slide
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
@@ -39,7 +39,7 @@ PATH_RATE = 25.0
 
 @functools.cache
 def carrying() -> CarryAndPut:
-    """The generator, on the robot of the other tasks."""
+    """Make the generator, on the robot of the other tasks."""
     return CarryAndPut(robot=skill().robot)
 
 
@@ -88,7 +88,7 @@ class CarryAndPutEnv(BottleEnv):
         super().__init__(TrayScene(), DURATION, COURSE, track=True, **options)
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
         bottle, tray = (torch.from_numpy(pose) for pose in self._scene.objects)
         distance, angle = carrying().put_error(
             Frame(bottle[:3], bottle[3:]), Frame(tray[:3], tray[3:])
@@ -103,7 +103,7 @@ class CarryAndPutEnv(BottleEnv):
         }
 
     def _leaning(self) -> float:
-        """Of the bottle, from the vertical [deg]."""
+        """Return the bottle's angle with the vertical [deg]."""
         x, y = self._scene.bottle[4:6]
         return math.degrees(2 * math.asin(min(1.0, math.hypot(x, y))))
 
@@ -167,7 +167,7 @@ class CarryAndPutEnv(BottleEnv):
         start, standing = self._start, self._standing()
         return _path(*map(tuple, (start.joints, standing, start.poses["tray"], start.slide)))
 
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: Array) -> bool:
         return carrying().usual(Frame(bottle[:3], bottle[3:]))
 
 

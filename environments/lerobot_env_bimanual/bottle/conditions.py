@@ -18,7 +18,7 @@ MASS = (0.5, 1.5)
 
 @functools.cache
 def skill() -> BottleShaking:
-    """The generator of the demonstrations, made once: building its robot takes a while."""
+    """Make the generator of the demonstrations once: building its robot takes a while."""
     return BottleShaking(steady_rhythm=True)
 
 

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.measures import Closing
 from lerobot_env_bimanual.bottle.scene import CARRIERS, BottleScene, Snapshot
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.disturbances import Course, displaced
+from lerobot_env_bimanual.disturbances import Course, displace_pose
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Demonstration, Frame
 
@@ -50,14 +50,14 @@ class BottleEnv(ControlledEnv):
 
     @abstractmethod
     def _nominal(self) -> Demonstration:
-        """The generator's path for this start posture and the objects where they are.
+        """Return the generator's path for this start posture and the objects where they are.
 
         Its event ``"grasp"`` says from when on the hands hold the bottle.
         """
 
     @abstractmethod
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
-        """Whether the task is meant for a bottle there."""
+    def _stands_usually(self, bottle: Array) -> bool:
+        """Check whether the task is meant for a bottle there."""
 
     def _begin(self, options: Mapping[str, Any]) -> Start:
         start = self._draw(options)
@@ -71,7 +71,7 @@ class BottleEnv(ControlledEnv):
         return start
 
     def grasp(self) -> tuple[float, float]:
-        """How far the worse hand was from its grasp pose when the hands closed [mm, deg].
+        """Measure how far the worse hand was from its grasp pose when both closed [mm, deg].
 
         If they never did, when they were nearest to the bottle.
         """
@@ -108,7 +108,7 @@ class BottleEnv(ControlledEnv):
         self._contact = self._scene.joints, self._scene.bottle
         self._scene.hold()
 
-    def _since_grasp(self) -> NDArray[np.float64]:
+    def _since_grasp(self) -> Array:
         """Joints [rad] and the bottle's height [m], (T, 18), at the rate of the control."""
         first = self._counted if self._grasp_step is None else self._grasp_step
         times, motion = (part[first : self._counted] for part in (self._instants, self._motion))
@@ -117,12 +117,12 @@ class BottleEnv(ControlledEnv):
         grid = np.arange(times[0], times[-1], 1 / self.fps)
         return np.stack([np.interp(grid, times, column) for column in motion.T], axis=1)
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
-        return self._stands_usually(displaced(self._start.poses["bottle"], step))
+    def _usual(self, step: Array) -> bool:
+        return self._stands_usually(displace_pose(self._start.poses["bottle"], step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         if self._grasp_step is None:
-            self._scene.put_bottle(displaced(self._start.poses["bottle"], step))
+            self._scene.put_bottle(displace_pose(self._start.poses["bottle"], step))
 
     def _restore(self, before: Snapshot) -> None:
         super()._restore(before)
@@ -139,19 +139,19 @@ class BottleEnv(ControlledEnv):
         self._scene.place(_at(path, instant), max(0.0, held_for))
         self._hold_still()
 
-    def _standing(self) -> NDArray[np.float64]:
-        """The bottle's pose, or what it was when it was last free; shape (7,)."""
+    def _standing(self) -> Array:
+        """Return the bottle's pose, or that when it was last free; shape (7,)."""
         return self._scene.bottle if self._grasp_step is None else self._contact[1]
 
     def _instant(self) -> float:
-        """Where on the nominal path the robot is, not further off than a path can be [s]."""
+        """Find the nearest instant of the nominal path, within 2.5 s of the time [s]."""
         path = self._nominal()
         distance = (path.joints - torch.from_numpy(self._scene.joints)).square().sum(-1)
         distance[(path.time - self._free).abs() > 2.5] = math.inf
         return float(path.time[distance.argmin()])
 
 
-def _at(path: Demonstration, instant: float) -> NDArray[np.float64]:
-    """The posture at an instant, between time steps."""
+def _at(path: Demonstration, instant: float) -> Array:
+    """Interpolate the posture at an instant."""
     time, joints = path.time.numpy(), path.joints.numpy()
     return np.array([np.interp(instant, time, column) for column in joints.T])

@@ -35,8 +35,8 @@ class Figure(NamedTuple):
     high: float = math.inf
 
     @property
-    def limited(self) -> bool:
-        """Whether a success depends on it."""
+    def has_limit(self) -> bool:
+        """Dependence of a success on it."""
         return self.low > 0 or self.high < math.inf
 
 
@@ -62,7 +62,7 @@ PUT_FIGURES = MappingProxyType(
 
 
 def successful(values: Mapping[str, float], figures: Mapping[str, Figure] = FIGURES) -> bool:
-    """Whether an episode is one of success.
+    """Check whether an episode is one of success.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def successful(values: Mapping[str, float], figures: Mapping[str, Figure] = FIGU
     figures : mapping of str to Figure
         What was asked for.
     """
-    limited = {name: figure for name, figure in figures.items() if figure.limited}
+    limited = {name: figure for name, figure in figures.items() if figure.has_limit}
     return all(figure.low <= values[name] <= figure.high for name, figure in limited.items())
 
 

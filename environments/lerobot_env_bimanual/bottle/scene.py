@@ -12,8 +12,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
 from lerobot_env_bimanual.robot_scene import (
     BOX,
@@ -99,7 +100,7 @@ class Snapshot:
         Its height [m].
     """
 
-    positions: NDArray[np.float64]
+    positions: Array
     held: bool
     table: float
 
@@ -128,7 +129,7 @@ class BottleScene(RobotScene):
         self._unit_inertia = model.body_inertia[self._bottle].copy()  # of 1 kg
 
     @property
-    def bottle(self) -> NDArray[np.float64]:
+    def bottle(self) -> Array:
         """The bottle's position [m] and orientation, a unit quaternion; shape (7,)."""
         return self.data.qpos[self._n :].copy()
 
@@ -138,7 +139,7 @@ class BottleScene(RobotScene):
         return float(self.model.body_pos[self._table, 2])
 
     @property
-    def objects(self) -> list[NDArray[np.float64]]:
+    def objects(self) -> list[Array]:
         """The poses of what is observed."""
         return [self.bottle]
 
@@ -166,15 +167,13 @@ class BottleScene(RobotScene):
         model.body_pos[self._table, 2] = data.qpos[self._n + 2] - FOOT
         mujoco.mj_forward(model, data)
 
-    def follow(
-        self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
-    ) -> None:
+    def follow(self, references: Array, torques: Array | None = None) -> None:
         """Simulate position control, as :meth:`RobotScene.follow` says; the table sinks."""
         super().follow(references, torques)
         if self.held:
             self._sink((len(references) - 1) * TIMESTEP)
 
-    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+    def place(self, joints: Array, seconds: float) -> None:
         """Put the joints somewhere without dynamics.
 
         The bottle follows both hands that hold it, half each, or stands on the table.
@@ -190,7 +189,7 @@ class BottleScene(RobotScene):
         data.qpos[:n] = joints
         mujoco.mj_kinematics(self.model, data)
         if self.held:
-            (left, turn), (right, other) = (self._carried(e) for e in range(2))
+            (left, turn), (right, other) = (self._pose_in_hand(e) for e in range(2))
             data.qpos[n : n + 3] = (left + right) / 2
             data.qpos[n + 3 :] = turn + math.copysign(1, turn @ other) * other
             mujoco.mj_normalizeQuat(self.model, data.qpos)
@@ -200,14 +199,14 @@ class BottleScene(RobotScene):
             data.qpos[n + 2] = self.model.body_pos[self._table, 2] + FOOT
         data.time += seconds
 
-    def put_bottle(self, pose: NDArray[np.float64]) -> None:
+    def put_bottle(self, pose: Array) -> None:
         """Put the bottle somewhere, at rest; shape (7,)."""
         data, n = self.data, self._n
         data.qpos[n:], data.qvel[n:] = pose, 0
         mujoco.mj_kinematics(self.model, data)
 
     def snapshot(self) -> Snapshot:
-        """The state without velocities."""
+        """Return the state without velocities."""
         return Snapshot(self.data.qpos.copy(), self.held, self.table)
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -240,17 +239,17 @@ class BottleScene(RobotScene):
         self.data.eq_active[:] = False
 
     def pull(self) -> float:
-        """The larger force between the bottle and a hand that holds it [N]."""
+        """Return the larger force between the bottle and a hand that holds it [N]."""
         # rows of equality constraints come first, six per weld: force, then moment
         left, _, right, _ = self.data.efc_force[:12].reshape(4, 3)
         return math.sqrt(max(left @ left, right @ right))
 
     def slip(self) -> float:
-        """How far the hands are from where they took hold of the bottle [m]."""
-        left, right = (self._carried(weld)[0] for weld in range(2))
+        """Measure how far the hands are from where they took hold of the bottle [m]."""
+        left, right = (self._pose_in_hand(weld)[0] for weld in range(2))
         return float(np.linalg.norm(left - right) / 2)
 
-    def _carried(self, weld: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _pose_in_hand(self, weld: int) -> tuple[Array, Array]:
         """Position and orientation of the bottle, were it rigidly attached to one hand."""
         point, relative = self.model.eq_data[weld, :3], self.model.eq_data[weld, 6:10]
         hand, turn, moved = self._hands[weld], np.empty(4), np.empty(3)
@@ -271,17 +270,17 @@ class TrayScene(BottleScene):
         self._tray = self.model.body("tray").id
 
     @property
-    def tray(self) -> NDArray[np.float64]:
+    def tray(self) -> Array:
         """Its position [m] and orientation, a unit quaternion; shape (7,)."""
         place = self.model.body_pos[self._tray], self.model.body_quat[self._tray]
         return np.concatenate(place)
 
     @property
-    def objects(self) -> list[NDArray[np.float64]]:
+    def objects(self) -> list[Array]:
         """The poses of bottle and tray."""
         return [self.bottle, self.tray]
 
-    def put_tray(self, pose: NDArray[np.float64]) -> None:
+    def put_tray(self, pose: Array) -> None:
         """Put the tray somewhere; shape (7,)."""
         self.model.body_pos[self._tray], self.model.body_quat[self._tray] = pose[:3], pose[3:]
         mujoco.mj_forward(self.model, self.data)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import find_shaking, successful
@@ -103,7 +103,7 @@ class BottleShakingEnv(BottleEnv):
                 raise DataError(f"{name} is finite and above 0, got {getattr(self, name)!r}")
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is."""
+        """Measure how well the episode goes, so far; the class describes each figure."""
         distance, angle = self.grasp()
         motion = self._since_grasp()
         shaking = find_shaking(motion[:, self._pitches], self.fps, self.frequency)
@@ -133,7 +133,7 @@ class BottleShakingEnv(BottleEnv):
     def _nominal(self) -> Demonstration:
         return _path(tuple(self._start.joints), tuple(self._standing()))
 
-    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: Array) -> bool:
         return skill().usual(Frame(bottle[:3], bottle[3:]))
 
 

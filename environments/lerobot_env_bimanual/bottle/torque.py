@@ -8,9 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.scene import BottleScene, bottle_spec
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
@@ -77,15 +77,15 @@ class TorqueScene(BottleScene):
         self._friction = model.dof_damping[:n].copy()
         self._obstacle = model.geom("obstacle").id if obstacle else -1
         self.stiffness, self.damping = np.full(n, STIFFNESS), np.full(n, DAMPING)
-        self.torques: NDArray[np.float64] | None = None
+        self.torques: Array | None = None
         self.force, self._touched = 0.0, math.inf
 
     @property
-    def velocities(self) -> NDArray[np.float64]:
-        """Of the joints, shape (17,) [rad/s]."""
+    def velocities(self) -> Array:
+        """Velocities of the joints, shape (17,) [rad/s]."""
         return self.data.qvel[: self._n].copy()
 
-    def dynamics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def dynamics(self) -> tuple[Array, Array]:
         """Inertia matrix M (17, 17) [kg m^2] and bias torques h (17,) [N m] of the robot.
 
         ``M qdd + h = torque``, without joint friction, contacts and what the hands hold.
@@ -130,12 +130,10 @@ class TorqueScene(BottleScene):
             self.model.geom_pos[self._obstacle] = AWAY
 
     def touched_for(self) -> float:
-        """How long ago the obstacle was first touched [s]; minus infinity before."""
+        """Return the time since the obstacle was first touched [s]; minus infinity before."""
         return float(self.data.time) - self._touched
 
-    def _controls(
-        self, references: NDArray[np.float64], speeds: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _controls(self, references: Array, speeds: Array) -> Array:
         bias = self.model.actuator_biasprm
         if self.torques is not None:
             bias[:, 1:3] = 0
@@ -143,7 +141,7 @@ class TorqueScene(BottleScene):
         bias[:, 1], bias[:, 2] = -self.stiffness, -self.damping
         return self.stiffness * references + (self.damping + self._friction) * speeds
 
-    def _step(self, control: NDArray[np.float64]) -> None:
+    def _step(self, control: Array) -> None:
         data = self.data
         if self.torques is None:
             control = control + data.qfrc_bias[: self._n]
@@ -228,29 +226,29 @@ class BottleTorqueEnv(BottleShakingEnv):
             first = int(np.searchsorted(path.time.numpy(), rng.uniform(*INSTANT)))
             way = skill().robot.state(path.joints[first:]).position(hand).numpy()
             next(place for place in way if self._scene.block(place) > CLEARANCE)
-        return observation, {**info, **self._measured()}
+        return observation, {**info, **self._measurements()}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move for one period of the control; see :meth:`BottleShakingEnv.step`."""
         observation, reward, terminated, truncated, info = super().step(action)
         if self._scene.touched_for() > self.obstacle:
             self._scene.clear()
-        return observation, reward, terminated, truncated, {**info, **self._measured()}
+        return observation, reward, terminated, truncated, {**info, **self._measurements()}
 
-    def dynamics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def dynamics(self) -> tuple[Array, Array]:
         """See :meth:`TorqueScene.dynamics`."""
         return self._scene.dynamics()
 
-    def _measured(self) -> dict[str, Any]:
+    def _measurements(self) -> dict[str, Any]:
         return {"velocity": self._scene.velocities, "peak_contact_N": self._scene.force}
 
-    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
-        """The references; gains or torques go to the scene."""
+    def _read_action(self, action: ArrayLike) -> Array:
+        """Check the references, and give gains or torques to the scene."""
         if self.control == "reference":
-            return super()._checked(action)
+            return super()._read_action(action)
         scene, values = self._scene, np.asarray(action, dtype=np.float64)
         if self.control == "torque":
-            scene.torques = super()._checked(values)
+            scene.torques = super()._read_action(values)
             return np.clip(scene.joints, self._lower, self._upper)
         n = len(self.joint_names)
         if values.shape != (3 * n,):
@@ -259,7 +257,7 @@ class BottleTorqueEnv(BottleShakingEnv):
                 f"damping of {n} joints, shape ({3 * n},): {list(self.joint_names)}"
             )
         wanted, *gains = (
-            super(BottleTorqueEnv, self)._checked(v) for v in values.reshape(3, n)
+            super(BottleTorqueEnv, self)._read_action(v) for v in values.reshape(3, n)
         )
         if min(map(np.min, gains)) < 0:
             raise DataError(f"stiffness and damping are not below 0, got {values[n:].tolist()}")

@@ -37,7 +37,7 @@ TASK = "show the tags in the hand to the camera"
 
 
 def chain_of(rig: Rig, link: str) -> NDArray[np.intp]:
-    """The numbers of the joints that move a link, from its base on."""
+    """Find the numbers of the joints that move a link, from its base on."""
     model = rig.scene.model
     body, chain = model.body(link).id, set[int]()
     while body:
@@ -47,14 +47,12 @@ def chain_of(rig: Rig, link: str) -> NDArray[np.intp]:
 
 
 def _driven(rig: Rig) -> NDArray[np.intp]:
-    """The joints that have motors, among all."""
+    """Return the numbers of the joints that have motors, among all."""
     return np.asarray(rig.scene.model.actuator_trnid[:, 0], dtype=np.intp)
 
 
-def varied_postures(
-    rig: Rig, link: str, n: int, rng: np.random.Generator, camera: str | None = None
-) -> Vector:
-    """Postures in which a camera sees the tags that a link carries, as different as can be.
+def varied_postures(rig: Rig, link: str, n: int, rng: np.random.Generator) -> Vector:
+    """Draw postures, as different as can be, in which the first camera sees a link's tags.
 
     Parameters
     ----------
@@ -64,8 +62,6 @@ def varied_postures(
     n : int
         How many.
     rng : Generator
-    camera : str, optional
-        The first one by default.
 
     Returns
     -------
@@ -78,7 +74,24 @@ def varied_postures(
         If fewer are found.
     """
     scene, before = rig.scene, rig.scene.data.qpos.copy()
-    moved, camera = chain_of(rig, link), camera or next(iter(rig.views))
+    camera = next(iter(rig.views))
+    postures, poses = _draw_candidates(rig, link, camera, rng)
+    chosen = _choose_unlike(rig, link, n, postures, poses, camera, rng)
+    scene.data.qpos[:] = before
+    mujoco.mj_kinematics(scene.model, scene.data)
+    if len(chosen) < n:
+        raise DataError(
+            f"of {DRAWN} postures {len(chosen)} show the tags of {link} to the camera "
+            f"{camera!r}, {n} are asked for: is it before the robot, and not too far away?"
+        )
+    return _order_by_nearness(chosen, scene.joints)
+
+
+def _draw_candidates(
+    rig: Rig, link: str, camera: str, rng: np.random.Generator
+) -> tuple[list[Vector], list[Array]]:
+    """Draw postures in which tags may be seen, and the poses of the tags before the camera."""
+    scene, moved = rig.scene, chain_of(rig, link)
     low, high = scene.model.jnt_range[_driven(rig)[moved]].T
     joints, kept, seen = scene.joints, list[Vector](), list[Array]()
     for shares in (1 + RANGE * rng.uniform(-1, 1, (DRAWN, len(moved)))) / 2:
@@ -88,32 +101,42 @@ def varied_postures(
         if _faces(rig, pose, link):
             kept.append(joints.copy())
             seen.append(pose)
-    turns = Rotation.from_matrix([pose[:3, :3] for pose in [*seen, np.eye(4)]])
-    places = np.array([pose[:3, 3] for pose in [*seen, np.eye(4)]])
-    # one after the other that is most unlike the others, if its tags are found
-    detector, chosen = TagDetector(rig.carriers[link].target.family), list[int]()
-    gap = np.append(np.full(len(seen), np.inf), 0.0)
+    return kept, seen
+
+
+def _choose_unlike(
+    rig: Rig,
+    link: str,
+    n: int,
+    postures: list[Vector],
+    poses: list[Array],
+    camera: str,
+    rng: np.random.Generator,
+) -> list[Vector]:
+    """Choose one after the other that is most unlike the others, if its tags are found."""
+    turns = Rotation.from_matrix([pose[:3, :3] for pose in [*poses, np.eye(4)]])
+    places = np.array([pose[:3, 3] for pose in [*poses, np.eye(4)]])
+    target, chosen = rig.carriers[link].target, list[Vector]()
+    detector = TagDetector(target.family)
+    gap = np.append(np.full(len(poses), np.inf), 0.0)
     while len(chosen) < n and gap.any():
         best = int(gap.argmax())
-        _place(rig, kept[best])
+        _place(rig, postures[best])
         shown = [detector(rig.pictures(rng)[camera]).corners.keys() for _ in range(2)]
         gap[best] = 0.0
-        if all(found & rig.carriers[link].target.corners.keys() for found in shown):
-            chosen.append(best)
+        if all(found & target.corners.keys() for found in shown):
+            chosen.append(postures[best])
             apart = np.linalg.norm(places - places[best], axis=1) / APART
             gap = np.minimum(gap, np.hypot(apart, (turns[best].inv() * turns).magnitude()))
-    scene.data.qpos[:] = before
-    mujoco.mj_kinematics(scene.model, scene.data)
-    if len(chosen) < n:
-        raise DataError(
-            f"of {DRAWN} postures {len(chosen)} show the tags of {link} to the camera "
-            f"{camera!r}, {n} are asked for: is it before the robot, and not too far away?"
-        )
-    order, last = list[Vector](), scene.joints
-    while chosen:
-        nearest = min(chosen, key=lambda one: float(np.abs(kept[one] - last).max()))
-        chosen.remove(nearest)
-        order.append(last := kept[nearest])
+    return chosen
+
+
+def _order_by_nearness(postures: list[Vector], last: Vector) -> Vector:
+    """Go to the nearest of the postures that are left, time after time."""
+    order = list[Vector]()
+    while postures:
+        apart = [float(np.abs(posture - last).max()) for posture in postures]
+        order.append(last := postures.pop(int(np.argmin(apart))))
     return np.stack(order)
 
 
@@ -125,7 +148,7 @@ def _place(rig: Rig, joints: Vector) -> None:
 
 
 def _faces(rig: Rig, pose: Array, link: str) -> bool:
-    """Whether a tag is in the picture and faces the camera; something may be before it."""
+    """Check whether a tag is in the picture and faces the camera, hidden or not."""
     corners = np.stack([*rig.carriers[link].target.corners.values()])
     seen = transformed(pose, corners.reshape(-1, 3)).reshape(corners.shape)
     middle, out = seen.mean(axis=1), np.cross(seen[:, 1] - seen[:, 0], seen[:, 0] - seen[:, 3])
@@ -145,8 +168,8 @@ def calibration_episode(
     postures: Vector,
     fps: int,
     rng: np.random.Generator,
-    measured: Reading = np.asarray,
-    commanded: Reading = np.asarray,
+    measure: Reading,
+    command: Reading,
 ) -> Iterator[dict[str, Any]]:
     """Let a robot go through postures, and stand still in each.
 
@@ -160,9 +183,9 @@ def calibration_episode(
         Rows per second.
     rng : Generator
         Of the noise of the pictures.
-    measured, commanded : callable, optional
+    measure, command : callable
         What the robot reads where its joints are (n_joints,) [rad], and what it calls
-        references: with offsets, noise, in another unit. As they are by default.
+        references: with offsets, noise, in another unit.
 
     Yields
     ------
@@ -179,7 +202,7 @@ def calibration_episode(
         way = reference + minimum_jerk(time).numpy()[:, None] * (posture - reference)
         for first in range(0, rows * period, period):
             step = way[first : first + period + 1]
-            state, action = measured(scene.joints), commanded(step[-1])
+            state, action = measure(scene.joints), command(step[-1])
             yield row(TASK, state, action, rig.pictures(rng))
             scene.follow(step)
         reference = posture

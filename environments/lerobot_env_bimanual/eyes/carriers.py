@@ -53,14 +53,14 @@ class Carrier:
 
     @property
     def target(self) -> Target:
-        """Where the corners of the tags are."""
+        """Corners of the tags."""
         return target_from(self.entry)
 
 
 def cube_at(
     first: int, x: float = 0, y: float = 0, z: float = 0, size: float = CUBE
 ) -> Carrier:
-    """A cube of five tags, turned as the body is.
+    """Describe a cube of five tags, turned as the body is.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def cube_at(
 def flat_at(
     number: int, x: float, z: float, size: float = FLAT, upright: bool = True
 ) -> Carrier:
-    """A tag that lies in the plane z of the body, to be read from before the robot.
+    """Describe a tag in the plane z of the body, to be read from before the robot.
 
     Parameters
     ----------

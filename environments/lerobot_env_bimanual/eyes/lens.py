@@ -30,7 +30,7 @@ OVERSAMPLING, MARGIN = 2, 0.08
 
 
 def usual_camera(width: int = 640, height: int = 480) -> Camera:
-    """A camera of 60 degrees with the lens of a usual webcam.
+    """Make a camera of 60 degrees with the lens of a usual webcam.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Lens:
         self._maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
 
     def __call__(self, ideal: Picture) -> Picture:
-        """The picture (height, width, 3) of an ideal one that has ``size`` and ``fovy``."""
+        """Bend an ideal picture of ``size`` and ``fovy``; shape (height, width, 3)."""
         x, y = self._maps
         bent = cv2.remap(ideal, x, y, cv2.INTER_LINEAR)
         size = self.camera.width, self.camera.height
@@ -114,7 +114,7 @@ class Imperfections:
     jpeg: int | None = None
 
     def __call__(self, picture: Picture, rng: np.random.Generator) -> Picture:
-        """A picture (height, width, 3), spoiled."""
+        """Spoil a picture (height, width, 3)."""
         seen: Any = picture
         if self.gain != 1:
             seen = cv2.convertScaleAbs(seen, alpha=self.gain)
@@ -132,7 +132,7 @@ class Imperfections:
 
 
 def _streak(length: float, angle: float) -> NDArray[np.float32]:
-    """A kernel that spreads a point over a line [pixels, rad]."""
+    """Make a kernel that spreads a point over a line [pixels, rad]."""
     half = math.ceil(length / 2) + 1
     row = np.clip((length + 1) / 2 - np.abs(np.arange(-half, half + 1)), 0, 1)
     level = np.zeros((2 * half + 1, 2 * half + 1), np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,13 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_env_bimanual.eyes.rig import IMAGES
+from lerobot_env_bimanual.eyes.rig import IMAGES, Rig
 from tpgmm_datasets.lerobot.columns import with_frames
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.cell import write_cell
 
-__all__ = ["CODECS", "recording", "row"]
+__all__ = ["CODECS", "recording", "recording_of", "rig_to_record", "row"]
 
 #: What pictures are stored as: LeRobot's own choice, the other usual codec, no video.
 CODECS = {"av1": "libsvtav1", "h264": "h264", "pictures": None}
@@ -86,18 +86,8 @@ def recording(
 
     if codec not in CODECS:
         raise DataError(f"a codec is one of {list(CODECS)}, got {codec!r}")
-    names, video = list(joint_names), CODECS[codec]
-    joints: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
-    units = ["rad"] * len(names) if units is None else list(units)
-    joints |= {"info": {"units": units}} if units else {}
-    features: dict[str, Any] = {OBS_STATE: joints, ACTION: joints}
-    for name, (width, height) in cameras.items():
-        shape, axes = (height, width, 3), ["height", "width", "channels"]
-        kind = "video" if video else "image"
-        features[IMAGES + name] = {"dtype": kind, "shape": shape, "names": axes}
-    if objects:
-        poses = with_frames(None, list(objects))
-        features[OBS_ENV_STATE] = {**poses, "shape": tuple(poses["shape"])}
+    video = CODECS[codec]
+    features = _features(list(joint_names), cameras, objects, units, video is not None)
     with replacing(path) as new:
         if Path(path).exists():
             raise DataError(f"{path} exists: remove it, or give another folder")
@@ -118,6 +108,54 @@ def recording(
         write_cell(cell, new / CELL)
 
 
+def rig_to_record(
+    env: Any,
+    n: int,
+    cameras: str | Sequence[str],
+    size: tuple[int, int],
+    **options: Any,
+) -> Rig:
+    """Set up cameras before a ``ControlledEnv``, for a set of ``n`` episodes or postures."""
+    if n < 1:
+        raise DataError(f"at least one episode is recorded, got n={n}")
+    rig: Rig = env.rig(cameras, size, **options)
+    if not rig.views:
+        raise DataError("a set with videos needs a camera: --cameras front")
+    return rig
+
+
+def recording_of(
+    env: Any, rig: Rig, out: str | Path, cell: Mapping[str, Any], **options: Any
+) -> AbstractContextManager[Any]:
+    """Open a set, as :func:`recording` does, for a ``ControlledEnv`` and what a rig sees."""
+    names = [name + env.suffix for name in env.joint_names]
+    camera = rig.lens.camera
+    sizes = dict.fromkeys(rig.views, (camera.width, camera.height))
+    return recording(out, env.fps, names, sizes, cell, units=env.units, **options)
+
+
+def _features(
+    names: list[str],
+    cameras: Mapping[str, tuple[int, int]],
+    objects: Sequence[str],
+    units: Sequence[str] | None,
+    video: bool,
+) -> dict[str, Any]:
+    """Describe the columns of a set as LeRobot does."""
+    joints: dict[str, Any] = {"dtype": "float32", "shape": (len(names),), "names": names}
+    units = ["rad"] * len(names) if units is None else list(units)
+    joints |= {"info": {"units": units}} if units else {}
+    features: dict[str, Any] = {OBS_STATE: joints, ACTION: joints}
+    for name, (width, height) in cameras.items():
+        shape, axes = (height, width, 3), ["height", "width", "channels"]
+        kind = "video" if video else "image"
+        features[IMAGES + name] = {"dtype": kind, "shape": shape, "names": axes}
+    if objects:
+        poses = with_frames(None, list(objects))
+        features[OBS_ENV_STATE] = {**poses, "shape": tuple(poses["shape"])}
+    return features
+
+
 def row(
     task: str,
     state: ArrayLike,
@@ -125,7 +163,7 @@ def row(
     pictures: Mapping[str, NDArray[np.uint8]],
     poses: ArrayLike | None = None,
 ) -> dict[str, Any]:
-    """A row of a set that is being recorded.
+    """Make a row of a set that is being recorded.
 
     Parameters
     ----------

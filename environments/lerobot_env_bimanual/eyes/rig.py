@@ -44,7 +44,7 @@ class View:
 
 
 def looking(eye: ArrayLike, at: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """The pose (4, 4) of a camera that looks from one point at another [m]."""
+    """Return the pose (4, 4) of a camera that looks from one point at another [m]."""
     eye = np.asarray(eye, dtype=float)
     z = np.asarray(at, dtype=float) - eye
     z /= np.linalg.norm(z)
@@ -102,22 +102,27 @@ class Rig:
         self.checks = {"world": "base"} if checks is None else checks
         self.lens = Lens(camera or usual_camera())
         self.imperfections = imperfections or Imperfections()
-        spec = scene.spec.copy()
-        there = [body.name for body in spec.bodies]
-        used = [*self.carriers, *(view.link or "world" for view in self.views.values())]
-        if missing := [body for body in used if body not in there]:
-            raise DataError(f"the scene has no bodies {missing}; it has {there}")
-        for body, carrier in self.carriers.items():
-            add_carrier(spec, body, carrier)
-        for name, view in self.views.items():
-            place, mount = pose_vector(view.pose @ _TURNED), spec.body(view.link or "world")
-            seen = mount.add_camera(name=f"eye {name}", pos=place[:3], quat=place[3:])
-            seen.fovy = self.lens.fovy
-        self._model = spec.compile()
+        self._model = self._furnish(scene.spec.copy()).compile()
         self._data = mujoco.MjData(self._model)
         # bodies are the same; those of their geoms that are tags come last
         pairs = zip(self._model.body_geomadr, scene.model.body_geomnum, strict=True)
         self._geoms = np.concatenate([first + np.arange(n) for first, n in pairs])
+
+    def _furnish(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
+        """Add tags and cameras to the bodies that carry them."""
+        there = [body.name for body in spec.bodies]
+        mounts = {name: view.link or "world" for name, view in self.views.items()}
+        if missing := [
+            body for body in (*self.carriers, *mounts.values()) if body not in there
+        ]:
+            raise DataError(f"the scene has no bodies {missing}; it has {there}")
+        for body, carrier in self.carriers.items():
+            add_carrier(spec, body, carrier)
+        for name, view in self.views.items():
+            place, mount = pose_vector(view.pose @ _TURNED), spec.body(mounts[name])
+            camera = mount.add_camera(name=f"eye {name}", pos=place[:3], quat=place[3:])
+            camera.fovy = self.lens.fovy
+        return spec
 
     def pictures(self, rng: np.random.Generator) -> dict[str, NDArray[np.uint8]]:
         """Pictures of the cameras now.
@@ -159,7 +164,7 @@ class Rig:
         mujoco.mj_camlight(seen, self._data)
 
     def content(self) -> dict[str, Any]:
-        """The true cell file of the scene, as :mod:`tpgmm_vision.cell` describes it."""
+        """Return the true cell file of the scene, as :mod:`tpgmm_vision.cell` describes it."""
         cameras, objects, checks = (dict[str, dict[str, Any]]() for _ in range(3))
         for name, view in self.views.items():
             cameras[name] = camera_content(self.lens.camera, IMAGES + name)
@@ -177,12 +182,12 @@ class Rig:
         return {"cameras": cameras, "objects": objects, "checks": checks}
 
     def camera_pose(self, camera: str) -> Array:
-        """Where a camera is in the world (4, 4)."""
+        """Return a camera's pose in the world (4, 4)."""
         view = self.views[camera]
         return view.pose if view.link is None else self.pose(view.link) @ view.pose
 
     def pose(self, body: str) -> Array:
-        """Where a body is (4, 4)."""
+        """Return a body's pose in the world (4, 4)."""
         data = self.scene.data.body(body)
         return rigid(data.xmat.reshape(3, 3), data.xpos)
 

@@ -21,7 +21,7 @@ CHECK: Mapping[str, Carrier] = {"world": cube_at(0, 0.3, 0.43, 0.05, size=0.06)}
 
 
 def around(centre: ArrayLike, distance: float, azimuth: float, elevation: float) -> View:
-    """A camera that looks at a point.
+    """Place a camera that looks at a point.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ VIEWS: Mapping[str, View] = {
 
 
 def chosen_views(cameras: str | Sequence[str]) -> dict[str, View]:
-    """The views of cameras by their names.
+    """Choose the views of cameras by their names.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ class Recorded:
     success: bool
 
     def demonstration(self) -> Demonstration:
-        """The references, in frames as they were at the start."""
+        """Return the references, in frames as they were at the start."""
         poses = self.observed[0, len(JOINTS) :].reshape(len(FRAMES), 7)
         frames = {n: Frame(pose[:3], pose[3:]) for n, pose in zip(FRAMES, poses, strict=True)}
         time = torch.arange(len(self.references), dtype=torch.float64) / FPS

@@ -51,14 +51,14 @@ def metaworld_robot() -> Robot:
 
 
 def metaworld_operators(frames: Sequence[str] = FRAMES) -> list[Operator]:
-    """The hand as seen from each of the frames, and from the world with the gripper."""
+    """List the hand as seen from each frame, and from the world with the gripper."""
     return [Canonical(), *(RelativePosition("hand", frame) for frame in frames)]
 
 
 def displacement(
     reference: ArrayLike, target: ArrayLike, scale: float = ACTION_SCALE
 ) -> NDArray[np.float64]:
-    """The action that brings the hand's target to a reference, as far as one step goes.
+    """Compute the action that brings the hand's target to a reference, up to one step.
 
     Parameters
     ----------
@@ -81,5 +81,5 @@ def effort(opening: float) -> float:
 
 
 def opening(effort: float) -> float:
-    """The inverse of :func:`effort`, 0 closed to 1 open."""
+    """Invert :func:`effort`, 0 closed to 1 open."""
     return float((1.0 - np.clip(effort, -1.0, 1.0)) / 2.0)

@@ -8,9 +8,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation, StateEnv, finite_vector
+from lerobot_env_bimanual.base import Array, Observation, StateEnv, finite_vector
 from lerobot_env_bimanual.metaworld.hand import FPS, FRAMES, JOINTS, displacement, effort
 from lerobot_env_bimanual.metaworld.tasks import check_task
 from tpgmm_torch.exceptions import DataError, DependencyError
@@ -117,12 +117,12 @@ class MetaworldStateEnv(StateEnv):
         )
 
     @property
-    def target(self) -> NDArray[np.float64]:
-        """Where the target of the hand is now [m], (3,)."""
+    def target(self) -> Array:
+        """Present place of the hand's target [m], (3,)."""
         return np.array(self._env.data.mocap_pos[0])
 
     @property
-    def raw(self) -> NDArray[np.float64]:
+    def raw(self) -> Array:
         """Meta-World's own observation, (39,): what its scripted experts look at."""
         return self._raw
 
@@ -175,7 +175,7 @@ class MetaworldStateEnv(StateEnv):
 
 
 def metaworld_library() -> Any:
-    """The package ``metaworld``.
+    """Import the package ``metaworld``.
 
     Raises
     ------

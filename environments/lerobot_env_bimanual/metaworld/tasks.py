@@ -38,7 +38,7 @@ TUNED = TASKS[::2]
 
 
 def check_task(name: str) -> str:
-    """The name itself.
+    """Check the name of a task, and return it.
 
     Raises
     ------
@@ -51,6 +51,6 @@ def check_task(name: str) -> str:
 
 
 def difficulty(name: str) -> str:
-    """The group of :data:`DIFFICULTIES` that the task of a name is in."""
+    """Find the group of :data:`DIFFICULTIES` that the task of a name is in."""
     check_task(name)
     return next(group for group, names in DIFFICULTIES.items() if name in names)

@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.disturbances import Course, displaced
+from lerobot_env_bimanual.disturbances import Course, displace_pose
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.eyes.views import around
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
@@ -129,7 +129,7 @@ class BiSo101Env(ControlledEnv):
         )
         self.task, self.task_description = task, "put the cup on the saucer"
         self._reach = {side: Reach(self._scene, side) for side in SIDES}
-        bounds = self.stored(low), self.stored(high)
+        bounds = self.in_stored_units(low), self.in_stored_units(high)
         self.action_space = spaces.Box(
             *(b.astype(np.float32) for b in bounds), dtype=np.float32
         )
@@ -142,7 +142,7 @@ class BiSo101Env(ControlledEnv):
         """The simulated world, which an expert sees."""
         return self._scene
 
-    def stored(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    def in_stored_units(self, joints: Array) -> Array:
         """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
         return np.asarray((joints - self._zero) / self._factor)
 
@@ -153,7 +153,7 @@ class BiSo101Env(ControlledEnv):
         return {**super().cell_of_joints(), "joint_offsets": offsets}
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far."""
+        """Measure how well the episode goes, so far."""
         scene = self._scene
         saucer, cup = scene.data.body("saucer"), scene.data.body("cup")
         away = saucer.xmat.reshape(3, 3).T @ (cup.xpos - saucer.xpos)
@@ -188,19 +188,19 @@ class BiSo101Env(ControlledEnv):
         self._reference = np.array(self._scene.data.ctrl)
         self._queue = np.tile(self._reference, (self._start.delay + 1, 1))
 
-    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
-        return super()._checked(action) * self._factor + self._zero
+    def _read_action(self, action: ArrayLike) -> Array:
+        return super()._read_action(action) * self._factor + self._zero
 
     def _observation(self) -> Observation:
         observation = super()._observation()
-        return {**observation, "agent_pos": self.stored(observation["agent_pos"])}
+        return {**observation, "agent_pos": self.in_stored_units(observation["agent_pos"])}
 
     def _act(self, stopped: bool) -> None:
         self._scene.grip()
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
-        return CUP_BOX.contains(displaced(self._start.poses["cup"], step))
+    def _usual(self, step: Array) -> bool:
+        return CUP_BOX.contains(displace_pose(self._start.poses["cup"], step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         if RIGHT not in self._scene.taken:
-            self._scene.put("cup", displaced(self._start.poses["cup"], step))
+            self._scene.put("cup", displace_pose(self._start.poses["cup"], step))

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.so101.env import OPEN, BiSo101Env
 from lerobot_env_bimanual.so101.kinematics import ARM, Reach
 from lerobot_env_bimanual.so101.scene import (
@@ -25,9 +25,8 @@ from lerobot_env_bimanual.so101.scene import (
 )
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["MEETING", "PHASES", "teleoperated"]
+__all__ = ["MEETING", "PHASES", "teleoperate"]
 
-Array = NDArray[np.float64]
 #: Nominal seconds of the phases, which differ by up to a share.
 PHASES = {
     "reach": 2.2, "approach": 1.2, "close": 1.4, "lift": 1.0, "bring": 2.2, "hover": 0.4,
@@ -49,8 +48,8 @@ BOW = 0.01
 INTEGRAL, LARGEST = 3.0, math.radians(8.0)
 
 
-def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
-    """The actions of one demonstration.
+def teleoperate(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
+    """Give the actions of one demonstration.
 
     Parameters
     ----------
@@ -111,13 +110,13 @@ def teleoperated(env: BiSo101Env, rng: np.random.Generator) -> Iterator[Array]:
                 done = _jerk(min(1.0, spent / total))
                 left.move(brought + done * (meeting - brought), *carried)
             joints = np.concatenate((left.command(env), [0.0], right.command(env), [0.0]))
-            action = env.stored(joints)
+            action = env.in_stored_units(joints)
             action[ARM], action[-1] = 0.0, gripper
             yield action
 
 
 def _above(pose: Array, height: float) -> Array:
-    """A place (3,) so far above that of a pose."""
+    """Return a place (3,) so far above that of a pose."""
     return np.asarray(pose[:3] + np.array((0.0, 0.0, height)))
 
 
@@ -137,7 +136,7 @@ class _Arm:
         self._correction = scene.data.ctrl[self._rows] - self._wanted
 
     def place(self, point: Array) -> Array:
-        """Where a point of the hand should be now."""
+        """Return where a point of the hand should be now."""
         position, axes = self._reach.pose(self._wanted)
         return np.asarray(position + axes @ point)
 
@@ -149,7 +148,7 @@ class _Arm:
         return axes.T @ (pose[:3] - position), axes.T @ upright
 
     def heading(self, target: Array) -> Array:
-        """The level direction in which the hand points when it grips at a target."""
+        """Find the level direction in which the hand points when it grips at a target."""
         joints = self._reach(self._wanted, target, GRIP, RIGHT_UP)
         ahead = self._reach.pose(joints)[1][:, 2] * (1.0, 1.0, 0.0)
         return np.asarray(ahead / np.linalg.norm(ahead))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.so101.robot import hand_of
 from lerobot_env_bimanual.so101.scene import BiSo101Scene
 from tpgmm_torch.exceptions import DataError
@@ -39,7 +40,7 @@ class Reach:
         self._dofs = np.array([joint.dofadr[0] for joint in chosen])
         self._low, self._high = np.array([joint.range for joint in chosen]).T
 
-    def pose(self, joints: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pose(self, joints: ArrayLike) -> tuple[Array, Array]:
         """Position (3,) and axes (3, 3) of the hand, for joints (5,)."""
         self._data.qpos[self._places] = joints
         mujoco.mj_kinematics(self._model, self._data)
@@ -48,8 +49,8 @@ class Reach:
 
     def __call__(
         self, joints: ArrayLike, target: ArrayLike, point: ArrayLike, up: ArrayLike
-    ) -> NDArray[np.float64]:
-        """The posture, near another one, in which a point of the hand is at a target.
+    ) -> Array:
+        """Find the posture, near another one, in which a point of the hand is at a target.
 
         Parameters
         ----------

@@ -43,7 +43,7 @@ _DRAWN, _JAWS = (0.95, 0.75, 0.2, 1), (0.25, 0.25, 0.28, 1)
 
 
 def hand_of(side: str) -> str:
-    """The link between the ends of an arm's jaws."""
+    """Name the link between the ends of an arm's jaws."""
     return f"{side}_gripper_frame_link"
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.robot_scene import (
     BOX,
@@ -89,14 +89,14 @@ class BiSo101Scene(SuiteScene):
         self._plays = np.array(plays)
 
     @property
-    def angles(self) -> NDArray[np.float64]:
-        """Where the links are, behind the play of the joints, shape (12,) [rad]."""
+    def angles(self) -> Array:
+        """Angles of the links, behind the play of the joints, shape (12,) [rad]."""
         return np.asarray(self.data.qpos[self._places] + self.data.qpos[self._plays])
 
     def reset(
         self,
-        poses: Mapping[str, NDArray[np.float64]],
-        joints: NDArray[np.float64],
+        poses: Mapping[str, Array],
+        joints: Array,
         table: float = 0.0,
     ) -> None:
         """Let the arms come to rest where their servos are commanded.
@@ -121,9 +121,7 @@ class BiSo101Scene(SuiteScene):
             self._step(joints)
         mujoco.mj_kinematics(self.model, self.data)
 
-    def _controls(
-        self, references: NDArray[np.float64], speeds: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _controls(self, references: Array, speeds: Array) -> Array:
         """Those of servos, which know no speeds."""
         return references
 
@@ -142,7 +140,7 @@ class BiSo101Scene(SuiteScene):
 
 
 def _add_cup(spec: Any) -> None:
-    """A cup that stands on four feet, with a stem and a cube on it."""
+    """Add a cup that stands on four feet, with a stem and a cube on it."""
     cup, white = add_thing(spec, "cup"), {"rgba": (0.9, 0.9, 0.95, 1)}
     add_geom(cup, CYLINDER, (CUP, CUP_HALF, 0), pos=(0, 0, CUP_HALF), mass=0.06, **white)
     foot = {"conaffinity": TABLE | OBJECT, "contype": OBJECT, "mass": 0.005, **white}
@@ -157,7 +155,7 @@ def _add_cup(spec: Any) -> None:
 
 
 def _add_saucer(spec: Any) -> None:
-    """A saucer whose cube stands at the end of its x axis."""
+    """Add a saucer whose cube stands at the end of its x axis."""
     saucer, look = add_thing(spec, "saucer"), {"rgba": (0.35, 0.5, 0.75, 1)}
     size = (SAUCER, SAUCER_TOP, 0)
     add_geom(saucer, CYLINDER, size, name="saucer", mass=0.05, conaffinity=PALM, **look)
@@ -168,8 +166,8 @@ def _add_saucer(spec: Any) -> None:
     add_geom(saucer, BOX, (BLOCK,) * 3, pos=SAUCER_CUBE, mass=0.02, **look)
 
 
-def in_left_hand(aside: float = 0.0, turn: float = 0.0) -> NDArray[np.float64]:
-    """The saucer in the left gripper, shape (7,): level where that points down as it should.
+def in_left_hand(aside: float = 0.0, turn: float = 0.0) -> Array:
+    """Return the saucer's pose (7,) in the left gripper: level where that points down.
 
     Parameters
     ----------

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lerobot_env_bimanual.eyes.calibration import calibration_episode, varied_postures
 from lerobot_env_bimanual.eyes.carriers import cube_at
-from lerobot_env_bimanual.eyes.recorder import recording
+from lerobot_env_bimanual.eyes.recorder import recording_of, rig_to_record
 from lerobot_env_bimanual.so101.env import CHECKS, BiSo101Env
 from lerobot_env_bimanual.so101.robot import SIDES, hand_of
 from lerobot_env_bimanual.so101.scene import CUBE, LEFT, TAG
@@ -65,19 +64,17 @@ def record_waving(
     for name, place in AWAY.items():
         env.scene.put(name, np.array((*place, 1.0, 0.0, 0.0, 0.0)))
     cubes = {hand_of(side): cube_at(first, z=CUBE, size=TAG) for side, first in IN_HAND.items()}
-    rig = env.rig(cameras, size, carriers={**CHECKS, **cubes}, objects={})
+    rig = rig_to_record(env, n, cameras, size, carriers={**CHECKS, **cubes}, objects={})
     postures = np.concatenate(
         [varied_postures(rig, hand_of(side), n, rng)[:, PARTS[side]] for side in SIDES],
         axis=1,
     )
-    names, sizes = (
-        [name + env.suffix for name in env.joint_names],
-        dict.fromkeys(rig.views, size),
-    )
     cell = {**rig.content(), **env.cell_of_joints()}
-    settings: dict[str, Any] = {"units": env.units, "robot_type": env.robot_type}
-    with recording(out, fps, names, sizes, cell, codec=codec, **settings) as opened:
-        for row in calibration_episode(rig, postures, fps, rng, env.stored, env.stored):
+    options = {"codec": codec, "robot_type": env.robot_type}
+    with recording_of(env, rig, out, cell, **options) as opened:
+        for row in calibration_episode(
+            rig, postures, fps, rng, env.in_stored_units, env.in_stored_units
+        ):
             opened.add_frame(row)
         opened.save_episode()
     rig.close()

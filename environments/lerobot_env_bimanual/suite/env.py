@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from lerobot_env_bimanual.base import Observation
+from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Closing, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import (
@@ -22,7 +21,7 @@ from lerobot_env_bimanual.disturbances import (
     Disturbance,
     Spoilt,
     StartedMidway,
-    displaced,
+    displace_pose,
     parse_condition,
 )
 from lerobot_env_bimanual.robot_scene import add_table
@@ -49,7 +48,7 @@ SLIPS = 0.02
 
 
 def _skips(part: Disturbance) -> bool:
-    """Whether a part of the task would not be done."""
+    """Check whether a part of the task would not be done."""
     return isinstance(part, StartedMidway) or (isinstance(part, Displaced) and part.seconds > 0)
 
 
@@ -137,7 +136,7 @@ class SuiteEnv(ControlledEnv):
         return seen
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the task says what each figure is."""
+        """Measure how well the episode goes, so far; the task describes each figure."""
         return self._judge.figures(self._scene)
 
     def _successful(self, figures: Mapping[str, float]) -> bool:
@@ -193,20 +192,20 @@ class SuiteEnv(ControlledEnv):
                 if part.step is not None:
                     self._displace(part.step)
 
-    def _usual(self, step: NDArray[np.float64]) -> bool:
-        return self._task.usual(displaced(self._first, step))
+    def _usual(self, step: Array) -> bool:
+        return self._task.usual(displace_pose(self._first, step))
 
-    def _displace(self, step: NDArray[np.float64]) -> None:
+    def _displace(self, step: Array) -> None:
         name = self._task.objects[0]
         if not any(hold.thing == name for hold in self._scene.taken):
-            self._scene.put(name, displaced(self._first, step))
+            self._scene.put(name, displace_pose(self._first, step))
 
     @property
-    def _first(self) -> NDArray[np.float64]:
-        """Where the first object was at first."""
+    def _first(self) -> Array:
+        """Initial pose of the first object."""
         return self._start.poses[self._task.objects[0]]
 
-    def _remembered(self) -> Any:
+    def _take_snapshot(self) -> Any:
         return self._scene.snapshot(), copy.deepcopy(self._judge)
 
     def _restore(self, before: Any) -> None:

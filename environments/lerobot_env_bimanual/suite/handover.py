@@ -7,7 +7,7 @@ holds; afterwards the thing moves with another hand.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -20,12 +20,14 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
-    raised,
+    raise_pose,
     seen,
     vector,
 )
@@ -76,7 +78,7 @@ class Handover(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A baton, and a flat stand that nothing collides with."""
+        """Add a baton, and a flat stand that nothing collides with."""
         look = {"name": "baton", "rgba": (0.85, 0.3, 0.3, 1)}
         baton, size = add_thing(spec, "baton"), (RADIUS, FOOT, 0)
         add_geom(baton, CYLINDER, size, **look, mass=0.3, conaffinity=TABLE)
@@ -84,13 +86,11 @@ class Handover(SuiteTask):
         add_geom(stand, CYLINDER, (0.05, 0.001, 0), rgba=(0.2, 0.6, 0.3, 1))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The baton on the left, the stand on the right of the table."""
+        """Draw the baton on the left, the stand on the right of the table."""
         baton = BOX.draw(rng)
         return {"baton": baton, "stand": BOX.across(baton[2] - FOOT).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the baton, to the meeting, and back; right to the meeting and the stand."""
         baton, stand = poses["baton"], poses["stand"]
         meeting = Frame(vector(MEETING) + style.free * vector(MEETING_SPREAD))
@@ -99,7 +99,7 @@ class Handover(SuiteTask):
         left = [
             Leg("reach", self.near(baton, "l_hand", style), free=True),
             Leg("close", self.at_grip(baton, "l_hand")),
-            Leg("raise", self.at_grip(raised(baton, LIFT), "l_hand")),
+            Leg("raise", self.at_grip(raise_pose(baton, LIFT), "l_hand")),
             Leg("bring", self.at_grip(meeting, "l_hand"), free=True),
             Leg("leave", self.near(meeting, "l_hand", style)),
             Leg("carry", starts["l_hand"], free=True),
@@ -107,7 +107,7 @@ class Handover(SuiteTask):
         right = [
             Leg("bring", self.near(meeting, "r_hand", style), free=True),
             Leg("meet", self.at_grip(meeting, "r_hand")),
-            Leg("carry", self.at_grip(raised(place, LIFT), "r_hand"), free=True),
+            Leg("carry", self.at_grip(raise_pose(place, LIFT), "r_hand"), free=True),
             Leg("lower", self.at_grip(place, "r_hand")),
             Leg("away", self.near(place, "r_hand", style)),
         ]
@@ -118,7 +118,7 @@ class Handover(SuiteTask):
         return _Judge()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """The left hand seen from where the baton was, the hands from each other, the joints.
+        """List the left hand seen from the baton's place, the hands from each other, joints.
 
         With what is held, the baton from the stand; otherwise the right hand.
         """
@@ -155,7 +155,7 @@ class _Judge(Judge):
 
 
 def on_stand(scene: SuiteScene) -> dict[str, float]:
-    """How far the baton is from its place [mm], and how it leans [deg]."""
+    """Measure how far the baton is from its place [mm], and how it leans [deg]."""
     baton, stand = scene.pose("baton"), scene.pose("stand")
     away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
     return {
@@ -165,5 +165,5 @@ def on_stand(scene: SuiteScene) -> dict[str, float]:
 
 
 def height(scene: SuiteScene) -> float:
-    """Of the baton's foot above the table [m]."""
+    """Return the height of the baton's foot above the table [m]."""
     return float(scene.pose("baton")[2] - FOOT - scene.table)

@@ -8,7 +8,7 @@ the chord between them pulls the box away, or loses the grip.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -24,8 +24,10 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
@@ -91,7 +93,7 @@ class Lid(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A box, and on it a lid with a knob, which turns about the upper right edge."""
+        """Add a box, and on it a lid with a knob, which turns about the upper right edge."""
         wide, deep, _ = HALF
         box = add_thing(spec, "box")
         look = {"name": "box", "rgba": (0.75, 0.6, 0.4, 1)}
@@ -109,12 +111,10 @@ class Lid(SuiteTask):
         add_geom(lid, CUBOID, KNOB_HALF, mass=0.02, **look)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The box a little to the right of the middle."""
+        """Draw the box a little to the right of the middle."""
         return {"box": AREA.draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the box's side and back; right to the knob, about the hinge and back."""
         box = poses["box"]
         opened = torch.deg2rad(OPENED + SPREAD * style.free[:, 0])
@@ -122,9 +122,9 @@ class Lid(SuiteTask):
         hinge, point = map(vector, (HINGE, GRIP))
 
         def lid(share: Tensor) -> Frame:
-            """Where the right hand holds the lid, opened by a share of the angle."""
-            plate = _turned(Frame(box.transform(hinge), box.orientation), opened * share)
-            palm = _turned(Frame(plate.transform(point), plate.orientation), rolled)
+            """Return the right hand's pose at the lid, opened by a share of the angle."""
+            plate = _turn_about_x(Frame(box.transform(hinge), box.orientation), opened * share)
+            palm = _turn_about_x(Frame(plate.transform(point), plate.orientation), rolled)
             return place_hand(palm, ORIGIN)
 
         shut = lid(torch.zeros_like(opened))
@@ -153,13 +153,13 @@ class Lid(SuiteTask):
         return _Judge()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """The hands seen from the box, and from each other, which is the closed chain."""
+        """List the hands seen from the box, and from each other, which is the closed chain."""
         pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
         return [*(seen(*pair, orientation) for pair in pairs), Canonical()]
 
 
-def _turned(pose: Frame, angle: Tensor) -> Frame:
-    """The same place, turned about its x axis by angles (...) [rad]."""
+def _turn_about_x(pose: Frame, angle: Tensor) -> Frame:
+    """Turn a pose about its x axis by angles (...) [rad]."""
     half, zero = angle / 2, torch.zeros_like(angle)
     turn = torch.stack((half.cos(), half.sin(), zero, zero), dim=-1)
     turned = quaternions.product(pose.orientation, turn)

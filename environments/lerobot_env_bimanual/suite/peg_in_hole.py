@@ -9,7 +9,7 @@ hole it jams: both arms give way, as stiff as their position control, and the fo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -25,14 +25,16 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
-    moved,
-    raised,
+    raise_pose,
     seen,
+    shift_pose,
     vector,
 )
 from tpgmm_torch import Canonical, Frame, quaternions
@@ -94,7 +96,7 @@ class PegInHole(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A round peg with a head, and a block of boxes around a square hole with a chamfer."""
+        """Add a round peg with a head, and a block of boxes around a square hole."""
         peg = add_thing(spec, "peg")
         radius, tall = HEAD
         for name, size, height in (
@@ -111,13 +113,11 @@ class PegInHole(SuiteTask):
             add_geom(block, CUBOID, half, mass=0, **look, **SOLID)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The peg on the right, the block on the left of the table."""
+        """Draw the peg on the right, the block on the left of the table."""
         peg = AREA.draw(rng)
         return {"peg": peg, "block": AREA.across(peg[2] - LENGTH + HEIGHT).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the block and the meeting; right to the peg, beside, above, and in."""
         peg, block = poses["peg"], poses["block"]
         # nobody turns them on the way
@@ -125,22 +125,22 @@ class PegInHole(SuiteTask):
         meeting = Frame(place, block.orientation)
 
         def over(height: float) -> Frame:
-            """The peg so high above where the hole begins."""
+            """Return the peg so high above where the hole begins."""
             up = vector((0.0, 0.0, HEIGHT + LENGTH + height))
             return Frame(meeting.position + up, _straighter(peg))
 
         begun = over(ABOVE)
-        beside = moved(begun, vector(BESIDE) + style.aim[:, 1] * torch.tensor((1, 1, 0)))
+        beside = shift_pose(begun, vector(BESIDE) + style.aim[:, 1] * torch.tensor((1, 1, 0)))
         left = [
             Leg("reach", self.near(block, "l_hand", style), free=True),
             Leg("close", self.at_grip(block, "l_hand")),
-            Leg("lift", self.at_grip(raised(block, LIFT), "l_hand")),
+            Leg("lift", self.at_grip(raise_pose(block, LIFT), "l_hand")),
             Leg("bring", self.at_grip(meeting, "l_hand"), free=True),
         ]
         right = [
             Leg("reach", self.near(peg, "r_hand", style), free=True),
             Leg("close", self.at_grip(peg, "r_hand")),
-            Leg("lift", self.at_grip(raised(peg, LIFT), "r_hand")),
+            Leg("lift", self.at_grip(raise_pose(peg, LIFT), "r_hand")),
             Leg("bring", self.at_grip(beside, "r_hand"), free=True),
             Leg("align", self.at_grip(begun, "r_hand")),
             Leg("insert", self.at_grip(over(-IN), "r_hand")),
@@ -185,7 +185,7 @@ class _Judge(Judge):
 
 
 def _depth(scene: SuiteScene) -> float:
-    """How far the middle of the peg's end is below the hole's mouth, 0 beside it [m]."""
+    """Measure how deep the middle of the peg's end is in the hole, 0 beside it [m]."""
     peg, block = (scene.data.body(name) for name in ("peg", "block"))
     tip = peg.xpos - LENGTH * peg.xmat.reshape(3, 3)[:, 2]
     x, y, z = block.xmat.reshape(3, 3).T @ (tip - block.xpos)

@@ -7,7 +7,7 @@ is hard; the conditions ``slips`` and ``knocked`` spoil the first grasp.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
@@ -27,7 +27,18 @@ from lerobot_env_bimanual.suite.handover import (
     on_stand,
 )  # fmt: skip
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
-from lerobot_env_bimanual.suite.task import Box, Judge, Leg, Pose, Style, raised, seen, vector
+from lerobot_env_bimanual.suite.task import (
+    Box,
+    Frames,
+    Judge,
+    Leg,
+    Legs,
+    Pose,
+    Style,
+    raise_pose,
+    seen,
+    vector,
+)
 from tpgmm_torch import Canonical, Demonstration, Frame
 from tpgmm_torch.operators import Operator
 
@@ -59,22 +70,20 @@ class PickPlace(Handover):
     }
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The baton on the left, the stand in the middle of the table."""
+        """Draw the baton on the left, the stand in the middle of the table."""
         baton = BOX.draw(rng)
         low, high = ((*corner, baton[2] - FOOT) for corner in STANDS)
         return {"baton": baton, "stand": Box(low, high, BOX.yaw).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the baton, up, to the stand, and back; right nowhere."""
         baton, stand, hand = poses["baton"], poses["stand"], "l_hand"
         place = Frame(stand.transform(vector((0.0, 0.0, FOOT))), stand.orientation)
         left = [
             Leg("reach", self.near(baton, hand, style), free=True),
             Leg("close", self.at_grip(baton, hand)),
-            Leg("lift", self.at_grip(raised(baton, LIFT), hand)),
-            Leg("carry", self.at_grip(raised(place, LIFT), hand), free=True),
+            Leg("lift", self.at_grip(raise_pose(baton, LIFT), hand)),
+            Leg("carry", self.at_grip(raise_pose(place, LIFT), hand), free=True),
             Leg("lower", self.at_grip(place, hand)),
             Leg("away", self.near(place, hand, style)),
             Leg("home", starts[hand], free=True),
@@ -86,13 +95,13 @@ class PickPlace(Handover):
         return _Judge()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """The hand seen from where the baton was and from the stand, what it holds; joints."""
+        """List the hand seen from baton and stand, what it holds, and the joints."""
         own = [seen("baton", "stand", orientation, held)] if held else []
         hand = [seen("l_hand", frame, orientation) for frame in ("baton", "stand")]
         return [*hand, *own, Canonical()]
 
     def operators_of(self, skill: str) -> list[Operator]:
-        """The subspaces of ``pick``, ``place`` or ``home``, learned by itself."""
+        """List the subspaces of ``pick``, ``place`` or ``home``, learned by itself."""
         pick, *place, joints = self.operators()
         return {"pick": [pick, joints], "place": [*place, joints]}.get(skill, [joints])
 

@@ -9,16 +9,16 @@ vertical is free: the mouth's place and the jug's turn only go together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
@@ -26,12 +26,14 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
-    raised,
+    raise_pose,
     seen,
     vector,
 )
@@ -100,7 +102,7 @@ class Pour(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A cup and a jug, which collide with the table alone."""
+        """Add a cup and a jug, which collide with the table alone."""
         shapes = {
             "cup": (CUP, CUP_HALF, 0.15, (0.3, 0.5, 0.85, 1)),
             "jug": (JUG, JUG_HALF, 0.3, (0.9, 0.75, 0.3, 1)),
@@ -110,13 +112,11 @@ class Pour(SuiteTask):
             add_geom(body, CYLINDER, (radius, half, 0), mass=mass, conaffinity=TABLE, **look)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """The cup on the right, the jug on the left of the table."""
+        """Draw the cup on the right, the jug on the left of the table."""
         cup = BOX.draw(rng)
         return {"cup": cup, "jug": BOX.across(cup[2] - CUP_HALF + JUG_HALF).draw(rng)}
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Right to the cup, and lifts it; left to the jug, over the cup, and back."""
         cup, jug = poses["cup"], poses["jug"]
         aside = dict(zip(GRIP, style.aim.unbind(1), strict=True))
@@ -138,7 +138,7 @@ class Pour(SuiteTask):
         left = [
             Leg("reach", self.near(jug, "l_hand", style), free=True),
             Leg("lift", self.at_grip(jug, "l_hand")),
-            Leg("raise", self.at_grip(raised(jug, LIFT), "l_hand")),
+            Leg("raise", self.at_grip(raise_pose(jug, LIFT), "l_hand")),
             Leg("bring", self.at_grip(ready, "l_hand"), free=True),
             pouring("tilt", minimum_jerk),
             pouring("pour", torch.ones_like),
@@ -174,7 +174,7 @@ def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:
 
 
 def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:
-    """The jug (n,), tilted so far, its mouth where it should then be for a cup.
+    """Return the jug (n,), tilted so far, its mouth where it should then be for a cup.
 
     While it is upright that is beside the cup, and it goes above it as it is tilted.
     """
@@ -193,11 +193,11 @@ class _Judge(Judge):
     def __init__(self) -> None:
         self.full = 1.0
         self.poured = self.spilled = self.lean = 0.0
-        self.mouth: NDArray[np.float64] | None = None
+        self.mouth: Array | None = None
         # what falls: how much of it, where, how fast
-        self.amounts: NDArray[np.float64] = np.zeros(0)
-        self.places: NDArray[np.float64] = np.zeros((0, 3))
-        self.speeds: NDArray[np.float64] = np.zeros((0, 3))
+        self.amounts: Array = np.zeros(0)
+        self.places: Array = np.zeros((0, 3))
+        self.speeds: Array = np.zeros((0, 3))
 
     def note(self, scene: SuiteScene, seconds: float) -> None:
         before = _seen(scene, self.places)
@@ -209,9 +209,7 @@ class _Judge(Judge):
         self._arrive(before, _seen(scene, self.places), _lean(scene, "cup") <= UPRIGHT)
         self._flow(scene, seconds)
 
-    def _arrive(
-        self, before: NDArray[np.float64], after: NDArray[np.float64], upright: bool
-    ) -> None:
+    def _arrive(self, before: Array, after: Array, upright: bool) -> None:
         """Count what came down to the cup's rim between two instants, seen from the cup."""
         down = after[:, 2] <= CUP_HALF
         before, after = before[down], after[down]
@@ -249,13 +247,13 @@ class _Judge(Judge):
         }
 
 
-def _seen(scene: SuiteScene, places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _seen(scene: SuiteScene, places: Array) -> Array:
     """Places (n, 3) as seen from the cup [m]."""
     cup = scene.data.body("cup")
     return np.asarray((places - cup.xpos) @ cup.xmat.reshape(3, 3))
 
 
 def _lean(scene: SuiteScene, name: str) -> float:
-    """Of an object's axis from the vertical [deg]."""
+    """Return the angle of an object's axis with the vertical [deg]."""
     cosine = float(scene.data.body(name).xmat[8])
     return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

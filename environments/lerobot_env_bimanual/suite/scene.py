@@ -10,8 +10,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.robot_scene import RobotScene, add_weld
 
 __all__ = ["OBJECT", "Hold", "SuiteScene", "add_thing"]
@@ -93,7 +93,7 @@ class SuiteScene(RobotScene):
         self._welds = {hold: model.equality(f"{hold.hand} {hold.thing}").id for hold in holds}
 
     @property
-    def objects(self) -> list[NDArray[np.float64]]:
+    def objects(self) -> list[Array]:
         """The poses of what is observed, shape (7,) each."""
         return [self.pose(name) for name in self.names]
 
@@ -102,12 +102,12 @@ class SuiteScene(RobotScene):
         """Height of the table [m]."""
         return float(self.model.body_pos[self.model.body("table").id, 2])
 
-    def pose(self, name: str) -> NDArray[np.float64]:
-        """A body's position [m] and orientation, a unit quaternion; shape (7,)."""
+    def pose(self, name: str) -> Array:
+        """Return a body's position [m] and orientation, a unit quaternion; shape (7,)."""
         body = self.data.body(name)
         return np.concatenate((body.xpos, body.xquat))
 
-    def put(self, name: str, pose: NDArray[np.float64]) -> None:
+    def put(self, name: str, pose: Array) -> None:
         """Put an object somewhere, at rest; shape (7,)."""
         model, data, body = self.model, self.data, self.model.body(name).id
         if model.body_jntnum[body] and model.jnt_type[model.body_jntadr[body]] == 0:  # free
@@ -119,8 +119,8 @@ class SuiteScene(RobotScene):
 
     def reset(
         self,
-        poses: Mapping[str, NDArray[np.float64]],
-        joints: NDArray[np.float64],
+        poses: Mapping[str, Array],
+        joints: Array,
         table: float,
     ) -> None:
         """Stand still, the objects where they are put.
@@ -142,7 +142,7 @@ class SuiteScene(RobotScene):
             self.put(name, pose)
         mujoco.mj_forward(self.model, self.data)
 
-    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+    def place(self, joints: Array, seconds: float) -> None:
         """Put the joints somewhere without dynamics; objects stay where they are."""
         self.data.qpos[self._places] = joints
         mujoco.mj_kinematics(self.model, self.data)
@@ -155,7 +155,7 @@ class SuiteScene(RobotScene):
         return float(mujoco.mj_geomDistance(model, self.data, palm, grip, 1.0, points))
 
     def depth(self, body: str) -> float:
-        """How deep whatever moves is in a body that stands still, 0 if nowhere [m].
+        """Measure how deep whatever moves is in a body that stands still, 0 if nowhere [m].
 
         It is right with MuJoCo 3.12 or newer.
         """
@@ -180,7 +180,7 @@ class SuiteScene(RobotScene):
         self.held.discard(hold)
 
     def pull(self, hold: Hold) -> float:
-        """The force between a hand and what it holds [N]; 0 if it holds nothing."""
+        """Return the force between a hand and what it holds [N]; 0 if it holds nothing."""
         data = self.data
         rows = np.flatnonzero(
             (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
@@ -189,7 +189,7 @@ class SuiteScene(RobotScene):
         return math.sqrt(float(np.square(data.efc_force[rows]).sum()))
 
     def touch(self, first: str, second: str) -> float:
-        """The normal force between two geoms, pressing [N]."""
+        """Return the normal force between two geoms, pressing [N]."""
         model, data, total, part = self.model, self.data, 0.0, np.empty(6)
         pair = {model.geom(first).id, model.geom(second).id}
         for index in range(data.ncon):
@@ -198,7 +198,7 @@ class SuiteScene(RobotScene):
                 total += part[0]
         return total
 
-    def force(self, first: str, second: str) -> NDArray[np.float64]:
+    def force(self, first: str, second: str) -> Array:
         """Force of one body on another where they touch, friction too; shape (3,) [N]."""
         total, model = np.zeros(3), self.model
         bodies = model.body(first).id, model.body(second).id
@@ -208,7 +208,7 @@ class SuiteScene(RobotScene):
                 total += self._contact_force(index, pair == bodies)
         return total
 
-    def wrench(self, body: str) -> NDArray[np.float64]:
+    def wrench(self, body: str) -> Array:
         """Wrench of a body on all it touches, at its origin, shape (6,) [N, N m]."""
         total, own = np.zeros(6), self.model.body(body).id
         for index, geoms in enumerate(self.data.contact.geom):
@@ -220,7 +220,7 @@ class SuiteScene(RobotScene):
         return total
 
     def snapshot(self) -> tuple[Any, ...]:
-        """The state without velocities."""
+        """Return the state without velocities."""
         model, held, taken = self.model, self.held.copy(), self.taken.copy()
         places = model.body_pos.copy(), model.body_quat.copy()  # of what is not free
         return self.data.qpos.copy(), held, taken, model.eq_data.copy(), *places

@@ -17,9 +17,9 @@ from typing import ClassVar, NamedTuple
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
@@ -38,11 +38,11 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
 __all__ = [
-    "Box", "Judge", "Leg", "Pose", "Style", "SuiteTask", "hands_along", "moved", "raised",
-    "seen", "vector",
+    "Box", "Frames", "Judge", "Leg", "Legs", "Pose", "Style", "SuiteTask", "hands_along",
+    "raise_pose", "seen", "shift_pose", "vector",
 ]  # fmt: skip
 
-Pose = NDArray[np.float64]
+Pose = Array
 #: Durations differ by up to this share.
 STRETCH = 0.2
 #: Start postures differ by up to this in each joint, and the posture that the null space seeks
@@ -76,7 +76,7 @@ class Style:
 
     @classmethod
     def draw(cls, n: int, joints: int, rng: np.random.Generator) -> Style:
-        """Of ``n`` people."""
+        """Draw the styles of ``n`` people."""
         return cls(
             torch.from_numpy(rng.uniform(-POSTURE, POSTURE, (n, joints))),
             torch.from_numpy(BOW * rng.standard_normal((n, 2, 3))),
@@ -85,7 +85,7 @@ class Style:
         )
 
     def __getitem__(self, chosen: Sequence[int]) -> Style:
-        """Of some people."""
+        """Choose the styles of some people."""
         rows = list(chosen)
         return Style(self.posture[rows], self.bow[rows], self.aim[rows], self.free[rows])
 
@@ -117,6 +117,11 @@ class Leg:
     free: bool = False
 
 
+#: Poses by names, and the ways of both hands.
+Frames = Mapping[str, Frame]
+Legs = Mapping[str, Sequence[Leg]]
+
+
 class Judge(ABC):
     """Follows an episode, opens hands, and says in the end how well it was done.
 
@@ -134,12 +139,12 @@ class Judge(ABC):
         """
 
     def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
-        """Which hands open now."""
+        """Choose the hands that open now."""
         return ()
 
     @abstractmethod
     def figures(self, scene: SuiteScene) -> dict[str, float]:
-        """How well it goes, so far."""
+        """Measure how well it goes, so far."""
 
 
 class SuiteTask(ABC):
@@ -189,17 +194,15 @@ class SuiteTask(ABC):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """Where the objects are, shape (7,) each; always as many random numbers."""
+        """Draw the objects' poses, shape (7,) each; always as many random numbers."""
 
     def usual(self, pose: Pose) -> bool:
-        """Whether the task is meant for a first object there, as the table's height is."""
+        """Check whether the task is meant for a first object there, at that height."""
         return self.box.contains(pose)
 
     @abstractmethod
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
-        """The ways of both hands.
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
+        """Lay out the ways of both hands.
 
         Parameters
         ----------
@@ -212,11 +215,11 @@ class SuiteTask(ABC):
 
     @abstractmethod
     def judge(self) -> Judge:
-        """The judge of one episode."""
+        """Make the judge of one episode."""
 
     @abstractmethod
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """The subspaces in which TP-GMM learns the task.
+        """List the subspaces in which TP-GMM learns the task.
 
         Parameters
         ----------
@@ -228,7 +231,7 @@ class SuiteTask(ABC):
 
     @cached_property
     def duration(self) -> float:
-        """Of an episode: as long as the slowest demonstration, and a second [s]."""
+        """Length of an episode: that of the slowest demonstration, and a second [s]."""
         return math.ceil(sum(self.phases.values()) * (1 + STRETCH)) + 1.0
 
     def ends(self) -> dict[str, float]:
@@ -237,14 +240,14 @@ class SuiteTask(ABC):
         return dict(zip(self.phases, done.tolist(), strict=True))
 
     def at_grip(self, pose: Frame, hand: str) -> Frame:
-        """Where a hand is that touches a thing with a pose."""
+        """Return the pose of a hand that touches a thing with a pose."""
         return place_hand(pose, self.grip[hand])
 
     def near(self, pose: Frame, hand: str, style: Style) -> Frame:
-        """Where a hand waits beside a thing with a pose."""
-        return moved(place_hand(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
+        """Return the pose of a hand that waits beside a thing with a pose."""
+        return shift_pose(place_hand(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
 
-    def start_posture(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def start_posture(self, rng: np.random.Generator) -> Array:
         """Around the neutral one, shape (n_joints,) [rad]."""
         spread = rng.uniform(-START, START, self.robot.n_joints)
         posture = self.embodiment.posture.numpy() + spread
@@ -278,7 +281,7 @@ class SuiteTask(ABC):
         ends = torch.from_numpy(phases.lengths(n, rng).cumsum(1))
         style = Style.draw(n, self.robot.n_joints, rng)
         made = list(range(n) if only is None else only)
-        return self._moved(
+        return self._perform(
             [drawn[i] for i in made],
             torch.from_numpy(starts[made]),
             phases,
@@ -287,7 +290,7 @@ class SuiteTask(ABC):
         )
 
     def nominal(
-        self, poses: Mapping[str, Pose], joints: NDArray[np.float64], rate: float = 100.0
+        self, poses: Mapping[str, Pose], joints: Array, rate: float = 100.0
     ) -> Demonstration:
         """Motion of the expert without noise.
 
@@ -301,10 +304,10 @@ class SuiteTask(ABC):
         phases = Phases(self.phases, rate, 0.0)
         style = Style.none(1, self.robot.n_joints)
         starts = torch.from_numpy(joints[None])
-        [best] = self._moved([dict(poses)], starts, phases, phases.nominal_ends(1), style)
+        [best] = self._perform([dict(poses)], starts, phases, phases.nominal_ends(1), style)
         return best
 
-    def _moved(
+    def _perform(
         self,
         drawn: Sequence[Mapping[str, Pose]],
         starts: Tensor,
@@ -341,12 +344,12 @@ class SuiteTask(ABC):
 
 
 def hands_along(
-    starts: Mapping[str, Frame],
-    legs: Mapping[str, Sequence[Leg]],
+    starts: Frames,
+    legs: Legs,
     progress: Mapping[str, Tensor],
     bow: Tensor,
 ) -> list[Frame]:
-    """Where both hands should be, when a share of each phase is done: (..., n).
+    """Compute where both hands should be, when a share of each phase is done: (..., n).
 
     Parameters
     ----------
@@ -372,28 +375,28 @@ def hands_along(
             if leg.free:
                 # nothing at both ends, without a speed there
                 bump = torch.sin(math.pi * minimum_jerk(done)).square()
-                pose = moved(pose, bump[..., None] * aside)
+                pose = shift_pose(pose, bump[..., None] * aside)
         poses.append(pose)
     return poses
 
 
-def moved(pose: Frame, offset: Tensor) -> Frame:
-    """The pose, shifted by an offset (3,) [m]."""
+def shift_pose(pose: Frame, offset: Tensor) -> Frame:
+    """Shift a pose by an offset (3,) [m]."""
     return Frame(pose.position + offset, pose.orientation)
 
 
-def raised(pose: Frame, height: float) -> Frame:
+def raise_pose(pose: Frame, height: float) -> Frame:
     """Lifted straight up [m], as what stands on the table is before it is carried away."""
-    return moved(pose, vector((0.0, 0.0, height)))
+    return shift_pose(pose, vector((0.0, 0.0, height)))
 
 
 def vector(values: Sequence[float]) -> Tensor:
-    """A tensor of double precision."""
+    """Make a tensor of double precision."""
     return torch.tensor(values, dtype=torch.float64)
 
 
 def seen(what: str, frame: str, orientation: bool, held: bool = False) -> Stack:
-    """Where a link, or what is ``held``, is seen from a frame, turned or not."""
+    """Make the operator of a link, or what is ``held``, in a frame, turned or not."""
     kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
     return Stack(*(kind(what, frame, held=held) for kind in kinds))
 
@@ -406,24 +409,24 @@ class Box(NamedTuple):
     yaw: float
 
     def draw(self, rng: np.random.Generator) -> Pose:
-        """A pose (7,) in it."""
+        """Draw a pose (7,) in it."""
         position = rng.uniform(self.lowest, self.highest)
         half = math.radians(rng.uniform(-self.yaw, self.yaw)) / 2
         return np.concatenate((position, (math.cos(half), 0.0, 0.0, math.sin(half))))
 
     def across(self, height: float) -> Box:
-        """The same on the other side of the table, at a height [m]."""
+        """Mirror the box to the other side of the table, at a height [m]."""
         (x, y, _), (far, wide, _) = self.lowest, self.highest
         return Box((x, -wide, height), (far, -y, height), self.yaw)
 
     def contains(self, pose: Pose) -> bool:
-        """Whether :meth:`draw` may give a pose (7,), but for rounding."""
+        """Check whether :meth:`draw` may give a pose (7,), but for rounding."""
         w, x, y, z = pose[3:]
         turn = (math.degrees(2 * math.atan2(z, w)) + 180) % 360 - 180
         upright = math.hypot(x, y) < 1e-6 and abs(turn) < self.yaw + 1e-6
         return self.surrounds(pose) and upright
 
     def surrounds(self, pose: Pose) -> bool:
-        """Whether a pose is between the corners, however turned, but for rounding."""
+        """Check whether a pose is between the corners, however turned, but for rounding."""
         low, high = np.subtract(self.lowest, 1e-9), np.add(self.highest, 1e-9)
         return bool(np.all((low <= pose[:3]) & (pose[:3] <= high)))

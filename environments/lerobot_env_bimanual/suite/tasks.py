@@ -24,7 +24,7 @@ TASKS: dict[str, type[SuiteTask]] = {
 
 @functools.cache
 def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
-    """A task by its name, and that of the robot that does it.
+    """Make a task by its name, and that of the robot that does it.
 
     Raises
     ------

@@ -8,7 +8,6 @@ instants say neither; nor is the force anywhere in the observation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import mujoco
@@ -23,13 +22,15 @@ from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
+    Frames,
     Judge,
     Leg,
+    Legs,
     Pose,
     Style,
     SuiteTask,
-    moved,
     seen,
+    shift_pose,
     vector,
 )
 from tpgmm_datasets.bottle.skill import HANDS, place_hand
@@ -90,7 +91,7 @@ class Wipe(SuiteTask):
     }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
-        """A board on a foot, its edge, and a sponge on the right palm."""
+        """Add a board on a foot, its edge, and a sponge on the right palm."""
         board = add_thing(spec, "board", free=False)
         long, wide, thick = BOARD
         shapes = {
@@ -108,7 +109,7 @@ class Wipe(SuiteTask):
         add_geom(spec.body("r_hand"), BOX, SPONGE, mass=0.02, solimp=impedance, **look, **soft)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
-        """A board before the robot, turned and tilted."""
+        """Draw a board before the robot, turned and tilted."""
         position = rng.uniform(AREA.lowest, AREA.highest)
         largest = np.radians((TILT, TILT, AREA.yaw))
         roll, pitch, yaw = rng.uniform(-largest, largest)
@@ -118,7 +119,7 @@ class Wipe(SuiteTask):
         return {"board": np.concatenate((position, quaternions.product(turn, tilt).numpy()))}
 
     def usual(self, pose: Pose) -> bool:
-        """Whether it may have been drawn, but for rounding."""
+        """Check whether the board may have been drawn, but for rounding."""
         orientation = torch.from_numpy(np.asarray(pose[3:], dtype=np.float64))
         yaw = 2 * math.atan2(float(orientation[3]), float(orientation[0]))
         turn = quaternions.exp(vector((0.0, 0.0, yaw)))
@@ -127,9 +128,7 @@ class Wipe(SuiteTask):
         level = math.degrees(float(tilt.abs().max())) <= TILT + 1e-6
         return AREA.surrounds(pose) and turned and level
 
-    def legs(
-        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
-    ) -> Mapping[str, Sequence[Leg]]:
+    def legs(self, starts: Frames, poses: Frames, style: Style) -> Legs:
         """Left to the edge and back; right to the board, over it in a zigzag, and back."""
         board = poses["board"]
         left, right = style.aim.unbind(1)
@@ -139,19 +138,19 @@ class Wipe(SuiteTask):
             return _on(board, _zigzag(done), -PRESS)
 
         first, last = (torch.full((n,), share, dtype=torch.float64) for share in (0.0, 1.0))
-        behind = moved(_on(board, vector(BEHIND[:2]).expand(n, 2), BEHIND[2]), right)
+        behind = shift_pose(_on(board, vector(BEHIND[:2]).expand(n, 2), BEHIND[2]), right)
         return {
             "l_hand": [
-                Leg("reach", moved(_beside(board, WAIT), left), free=True),
+                Leg("reach", shift_pose(_beside(board, WAIT), left), free=True),
                 Leg("close", _beside(board, EDGE)),
-                Leg("away", moved(_beside(board, WAIT), left), free=True),
+                Leg("away", shift_pose(_beside(board, WAIT), left), free=True),
             ],
             "r_hand": [
                 Leg("reach", behind, free=True),
-                Leg("close", moved(_on(board, _zigzag(first), HOVER), right), free=True),
+                Leg("close", shift_pose(_on(board, _zigzag(first), HOVER), right), free=True),
                 Leg("press", zigzag(first)),
                 Leg("wipe", zigzag),
-                Leg("lift", moved(_on(board, _zigzag(last), HOVER), right)),
+                Leg("lift", shift_pose(_on(board, _zigzag(last), HOVER), right)),
                 Leg("away", behind, free=True),
             ],
         }
@@ -175,19 +174,19 @@ def _zigzag(done: Tensor) -> Tensor:
 
 
 def _beside(board: Frame, point: tuple[float, ...]) -> Frame:
-    """The left hand (n,) with its palm to the edge, at a point of the board's frame."""
-    return _turned(board, vector(point), (0.0, PITCH, 0.0))
+    """Return the left hand (n,) with its palm to the edge, at a point of the board's frame."""
+    return _turn_hand(board, vector(point), (0.0, PITCH, 0.0))
 
 
 def _on(board: Frame, place: Tensor, height: float) -> Frame:
-    """The right hand (...) with its palm to the board, the sponge so high above it."""
+    """Return the right hand (...) with its palm to the board, the sponge so high above it."""
     above = torch.full_like(place[..., :1], height + 0.01 + 2 * SPONGE[1])
     point = torch.cat((place, above), dim=-1)
-    return _turned(board, point, (0.0, 0.0, TURN), (-math.pi / 2, 0.0, 0.0))
+    return _turn_hand(board, point, (0.0, 0.0, TURN), (-math.pi / 2, 0.0, 0.0))
 
 
-def _turned(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
-    """A hand that is turned in the board's frame by rotation vectors, one after the other."""
+def _turn_hand(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
+    """Turn a hand in the board's frame by rotation vectors, one after the other."""
     orientation = board.orientation
     for turn in turns:
         orientation = quaternions.product(orientation, quaternions.exp(vector(turn)))

@@ -15,7 +15,7 @@ from lerobot_env_bimanual.disturbances import (
     Sagging,
     StartedMidway,
     Stopped,
-    displaced,
+    displace_pose,
 )
 from tests.support.bottle_expert import nominal, perform
 from tpgmm_torch import Frame
@@ -132,7 +132,7 @@ def test_a_bottle_is_moved_and_seen_where_it_is():
         env = made(Moved(seconds=seconds, moment=1.0))
         seen, _ = follow(env, 2.4)
         poses = np.array([observation["environment_state"] for observation in seen])
-        wanted = displaced(env._start.poses["bottle"], env._drawn[0].step)
+        wanted = displace_pose(env._start.poses["bottle"], env._drawn[0].step)
         np.testing.assert_allclose(poses[-1], wanted, atol=2e-3)
         assert skill().usual(Frame(wanted[:3], wanted[3:]))
         largest = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max()

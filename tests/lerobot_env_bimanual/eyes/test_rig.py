@@ -16,7 +16,7 @@ from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.bottle.torque import AWAY, BottleTorqueEnv
 from lerobot_env_bimanual.eyes import rig as rigs
 from lerobot_env_bimanual.eyes.carriers import cube_at, flat_at
-from lerobot_env_bimanual.eyes.cells import cell_of, perturbed
+from lerobot_env_bimanual.eyes.cells import cell_of
 from lerobot_env_bimanual.eyes.lens import usual_camera
 from lerobot_env_bimanual.eyes.rig import Rig, View, looking
 from lerobot_env_bimanual.eyes.views import CENTRE, VIEWS, around, chosen_views
@@ -25,7 +25,7 @@ from lerobot_env_bimanual.suite.env import SuiteEnv
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_vision.cell import cell_from
 from tpgmm_vision.detection.tags import TagDetector
-from tpgmm_vision.poses import angle_between, inverse, transformed
+from tpgmm_vision.poses import inverse, transformed
 
 pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
@@ -82,20 +82,6 @@ def test_the_cell_is_that_of_the_scene_and_what_is_estimated_is_there():
         assert np.isfinite(true).all()
     assert cell.cameras["front"].camera == usual_camera()
     np.testing.assert_allclose(cell.cameras["front"].pose, VIEWS["front"].pose, atol=1e-6)
-    env.close()
-
-
-def test_a_wrong_cell_is_wrong_by_so_much():
-    env = BottleShakingEnv(cameras="front")
-    env.reset(seed=0)
-    true = cell_of(env)
-    wrong = cell_from(perturbed(true, mm=3.0, deg=0.5, focal=0.01, seed=4))
-    before, after = cell_from(true).cameras["front"], wrong.cameras["front"]
-    apart = np.linalg.norm(after.pose[:3, 3] - before.pose[:3, 3])
-    assert apart == pytest.approx(3e-3, rel=1e-3)
-    assert np.degrees(angle_between(before.pose, after.pose)) == pytest.approx(0.5, rel=1e-3)
-    assert after.camera.focal_length[0] == pytest.approx(1.01 * before.camera.focal_length[0])
-    assert true == cell_of(env), "the true one is left alone"
     env.close()
 
 

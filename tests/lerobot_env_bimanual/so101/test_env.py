@@ -7,7 +7,7 @@ from lerobot.envs import EnvConfig
 
 import lerobot_env_bimanual  # noqa: F401
 from lerobot_env_bimanual.so101.env import BiSo101Env
-from lerobot_env_bimanual.so101.expert import teleoperated
+from lerobot_env_bimanual.so101.expert import teleoperate
 from lerobot_env_bimanual.so101.scene import LEFT, RIGHT
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
@@ -21,7 +21,7 @@ def shown(env, seed):
     """The figures of a demonstration, and what hands held meanwhile."""
     env.reset(seed=seed)
     held = [set(env.scene.held)]
-    for action in teleoperated(env, np.random.default_rng(seed)):
+    for action in teleoperate(env, np.random.default_rng(seed)):
         *_, info = env.step(action)
         if held[-1] != env.scene.held:
             held.append(set(env.scene.held))
@@ -40,7 +40,7 @@ def test_the_expert_puts_the_cup_on_the_saucer(env, seed):
 
 def test_a_robot_that_stands_still_does_not_succeed(env):
     env.reset(seed=3)
-    still, over = env.stored(np.array(env.scene.data.ctrl)), False
+    still, over = env.in_stored_units(np.array(env.scene.data.ctrl)), False
     while not over:
         *_, over, info = env.step(still)
     assert not info["is_success"]

@@ -17,7 +17,7 @@ from lerobot_env_bimanual.disturbances import (
     Displaced,
     Moved,
     Stopped,
-    displaced,
+    displace_pose,
 )
 from lerobot_env_bimanual.suite.env import SUITE_CONDITIONS, SuiteEnv
 from lerobot_env_bimanual.suite.handover import GRIP, LEFT, RIGHT
@@ -245,7 +245,7 @@ def test_where_an_object_may_not_be_turned_as_far_it_is_moved_less():
     for seed in range(20):
         env.reset(seed=seed)
         [part] = env._drawn
-        assert env._task.usual(displaced(env._first, part.step))
+        assert env._task.usual(displace_pose(env._first, part.step))
         shares.append(np.linalg.norm(part.step[:3]) / part.distance)
         assert abs(part.step[5]) == pytest.approx(shares[-1] * part.angle)
     assert 0.3 < min(shares) < 1
@@ -256,11 +256,11 @@ def test_the_first_object_is_moved_before_it_is_held_and_within_its_places(motio
         env = SuiteEnv("handover", fps=FPS, condition="moved")
         observation, _ = env.reset(seed=seed)
         [part] = env._drawn
-        assert TASK.usual(displaced(env._first, part.step))
+        assert TASK.usual(displace_pose(env._first, part.step))
         assert part.moment <= TASK.ends()["close"] - 1.5
     while env._time < part.moment + 0.1:
         observation, *_ = env.step(observation["agent_pos"])
-    wanted = displaced(env._first, part.step)
+    wanted = displace_pose(env._first, part.step)
     np.testing.assert_allclose(observation["environment_state"][:7], wanted, atol=1e-3)
     stand = env._start.poses["stand"]
     np.testing.assert_array_equal(observation["environment_state"][7:], stand)

@@ -62,11 +62,11 @@ def test_observing_forces_changes_nothing_else():
 def test_an_object_is_not_where_it_is_seen(condition, height, angle):
     [part] = parse_condition(condition)
     rng = np.random.default_rng(0)
-    part = part.drawn(rng, Course(1.0, 2.0, 3.0), lambda step: True)
+    part = part.draw(rng, Course(1.0, 2.0, 3.0), lambda step: True)
     turn = rng.normal(size=4)
     turn /= np.linalg.norm(turn)
     true = np.array([0.1, 0.2, 0.3, *turn])
-    thought = part.seen(true, true, 0.0, rng)
+    thought = part.observe(true, true, 0.0, rng)
     local = quaternions.rotate(
         quaternions.conjugate(torch.from_numpy(turn)), torch.from_numpy(true - thought)[:3]
     )

@@ -16,7 +16,7 @@ RATE = 50
 
 
 @pytest.fixture(scope="module")
-def shown() -> list[Demonstration]:
+def examples() -> list[Demonstration]:
     return TASK.demonstrations(2, seed=3, rate=float(RATE))
 
 
@@ -34,16 +34,16 @@ def between(motion: Demonstration, first: str, last: str) -> slice:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_the_expert_opens_the_lid_and_shuts_it(shown, index):
-    figures = done(shown[index])
+def test_the_expert_opens_the_lid_and_shuts_it(examples, index):
+    figures = done(examples[index])
     assert figures["is_success"], figures
     assert 86 < figures["opened_deg"] < 94 and figures["kept_s"] > 2.2
     # on the circle nothing pulls, and the box stays where it is
     assert figures["pull_n"] < 5 and figures["box_mm"] < 1 and figures["shut_deg"] < 1
 
 
-def test_the_chord_in_place_of_the_circle_pulls_the_box_away_or_loses_the_grip(shown):
-    motion = shown[0]
+def test_the_chord_in_place_of_the_circle_pulls_the_box_away_or_loses_the_grip(examples):
+    motion = examples[0]
     joints, part = motion.joints.numpy().copy(), between(motion, "hold", "open")
     # wide of the circle: as if the hinge were 4 cm higher, where the hand is half way
     robot, way = TASK.robot, np.sin(np.linspace(0, np.pi, part.stop - part.start))
@@ -58,8 +58,8 @@ def test_the_chord_in_place_of_the_circle_pulls_the_box_away_or_loses_the_grip(s
     assert figures["box_mm"] > 5 or not figures["grips"]
 
 
-def test_a_lid_that_is_opened_for_a_moment_was_not_kept_open(shown):
-    motion = shown[0]
+def test_a_lid_that_is_opened_for_a_moment_was_not_kept_open(examples):
+    motion = examples[0]
     part = between(motion, "open", "keep")
     joints = np.delete(motion.joints.numpy(), part, axis=0)
     figures = done(motion, joints)
@@ -67,15 +67,15 @@ def test_a_lid_that_is_opened_for_a_moment_was_not_kept_open(shown):
     assert not figures["is_success"]
 
 
-def test_a_lid_that_stays_open_is_not_shut(shown):
-    motion = shown[0]
+def test_a_lid_that_stays_open_is_not_shut(examples):
+    motion = examples[0]
     figures = done(motion, motion.joints.numpy()[: between(motion, "open", "keep").stop])
     assert figures["kept_s"] > 2 and figures["shut_deg"] > 80
     assert figures["grips"] and not figures["is_success"]
 
 
-def test_a_hand_that_misses_the_knob_opens_nothing(shown):
-    motion = shown[0]
+def test_a_hand_that_misses_the_knob_opens_nothing(examples):
+    motion = examples[0]
     joints = motion.joints.numpy().copy()
     joints[:, 10:] = joints[0, 10:]
     figures = done(motion, joints)

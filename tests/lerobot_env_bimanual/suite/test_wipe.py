@@ -30,7 +30,7 @@ def failing(info):
     return {name for name, f in TASK.figures.items() if not f.low <= info[name] <= f.high}
 
 
-def shifted(board, *offset):
+def shift_board(board, *offset):
     """A board that is displaced in its own frame."""
     w, x, y, z = board[3:]
     normal = np.array((2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)))
@@ -57,7 +57,7 @@ def test_half_of_the_strokes_wipe_half_of_it(motions, env):
 
 def test_above_the_board_nothing_is_wiped(motions, env):
     board = start_of(motions[0])["board"]
-    info = replay(env, motions[0], board=shifted(board, 0, 0, -0.008))
+    info = replay(env, motions[0], board=shift_board(board, 0, 0, -0.008))
     assert failing(info) == {"coverage", "force"}
     assert info["coverage"] == info["force"] == 0
 
@@ -66,9 +66,9 @@ def test_who_presses_deep_presses_hard(motions, env):
     """Boards that are higher than they seemed."""
     board = start_of(motions[1])["board"]
     usual = replay(env, motions[1])["force"]
-    info = replay(env, motions[1], board=shifted(board, 0, 0, 0.003))
+    info = replay(env, motions[1], board=shift_board(board, 0, 0, 0.003))
     assert 1.3 * usual < info["force"] < 2.2 * usual
-    assert "force" in failing(replay(env, motions[1], board=shifted(board, 0, 0, 0.015)))
+    assert "force" in failing(replay(env, motions[1], board=shift_board(board, 0, 0, 0.015)))
 
 
 def test_a_pause_counts_if_it_goes_on(motions, env):

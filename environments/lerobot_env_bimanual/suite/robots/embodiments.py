@@ -37,7 +37,7 @@ class Embodiment:
         [rad].
     spec : callable
         Makes the simulated robot, as
-        :func:`~lerobot_env_bimanual.robot_scene.controlled` gives it, its joints
+        :func:`~lerobot_env_bimanual.robot_scene.add_position_control` gives it, its joints
         in the order of ``robot``.
     """
 
@@ -55,7 +55,7 @@ EMBODIMENTS: dict[str, Callable[[], Embodiment]] = {
 
 @functools.cache
 def embodiment(name: str) -> Embodiment:
-    """A robot of the suite by its name, made once: building its kinematics takes a while.
+    """Make a robot of the suite once: building its kinematics takes a while.
 
     Raises
     ------

@@ -16,7 +16,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from lerobot_env_bimanual.robot_scene import PALM_SIZE, controlled
+from lerobot_env_bimanual.robot_scene import PALM_SIZE, add_position_control
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DependencyError
@@ -52,13 +52,13 @@ MIRRORED = (1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 
 
 def g1_posture() -> Tensor:
-    """Where it waits, straight and both hands before it, shape (17,) [rad]."""
+    """Return the posture in which it waits, hands before it, shape (17,) [rad]."""
     left, mirror = (torch.tensor(row, dtype=torch.float64) for row in (POSTURE, MIRRORED))
     return torch.cat((torch.zeros(len(WAIST), dtype=torch.float64), left, mirror * left))
 
 
 def g1_robot() -> Robot:
-    """The kinematics of waist and arms.
+    """Build the kinematics of waist and arms.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def g1_spec() -> mujoco.MjSpec:
     Returns
     -------
     mujoco.MjSpec
-        As :func:`~lerobot_env_bimanual.robot_scene.controlled` gives it.
+        As :func:`~lerobot_env_bimanual.robot_scene.add_position_control` gives it.
 
     Raises
     ------
@@ -103,13 +103,13 @@ def g1_spec() -> mujoco.MjSpec:
         spec.body(hand).add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=0)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
-    return controlled(spec, GAIN)
+    return add_position_control(spec, GAIN)
 
 
 def _description() -> Element:
-    """The URDF from the pelvis up, with hands, seen from the origin of the tasks."""
-    robot = ElementTree.parse(_located(URDF)).getroot()
-    meshes = _located(MESHES)
+    """Read the URDF from the pelvis up, with hands, seen from the origin of the tasks."""
+    robot = ElementTree.parse(_locate_file(URDF)).getroot()
+    meshes = _locate_file(MESHES)
     for link in robot.iter("link"):
         for shape in link.findall("collision"):
             link.remove(shape)
@@ -126,8 +126,8 @@ def _description() -> Element:
     return robot
 
 
-def _located(path: str) -> Path:
-    """A file or folder of the package."""
+def _locate_file(path: str) -> Path:
+    """Locate a file or folder of the package."""
     try:
         place = Path(str(distribution(PACKAGE).locate_file(path)))
     except PackageNotFoundError as error:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lerobot_env_bimanual.aloha.robot import ARM_JOINTS, HOW_TO_INSTALL, SIDES
-from lerobot_env_bimanual.robot_scene import PALM_SIZE, controlled
+from lerobot_env_bimanual.robot_scene import PALM_SIZE, add_position_control
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Robot, quaternions
 from tpgmm_torch.exceptions import DependencyError
@@ -41,13 +41,13 @@ MIRRORED = (-1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
 
 
 def viperx_posture() -> Tensor:
-    """Where both arms wait, shape (12,) [rad]."""
+    """Return the posture in which both arms wait, shape (12,) [rad]."""
     left, mirror = (torch.tensor(row, dtype=torch.float64) for row in (POSTURE, MIRRORED))
     return torch.cat((left, mirror * left))
 
 
 def viperx_robot() -> Robot:
-    """The kinematics of both arms: the six joints of the left one, then the right one's.
+    """Build the kinematics of both arms: the six joints of the left one, then the right one's.
 
     Returns
     -------
@@ -78,14 +78,14 @@ def viperx_spec() -> mujoco.MjSpec:
     Returns
     -------
     mujoco.MjSpec
-        As :func:`~lerobot_env_bimanual.robot_scene.controlled` gives it.
+        As :func:`~lerobot_env_bimanual.robot_scene.add_position_control` gives it.
 
     Raises
     ------
     DependencyError
         Without gym-aloha.
     """
-    return controlled(_arms())
+    return add_position_control(_arms())
 
 
 def _arms() -> mujoco.MjSpec:
@@ -111,15 +111,17 @@ def _arms() -> mujoco.MjSpec:
         for name in ARM_JOINTS:
             joint = spec.joint(f"{arm}/{name}")
             joint.name, joint.frictionloss = f"{side}_arm_{name}", 0.0
-        palm = gripper.add_body(name=hand, pos=(AHEAD, 0, 0), quat=_mounted(sign).numpy())
+        palm = gripper.add_body(
+            name=hand, pos=(AHEAD, 0, 0), quat=_hand_orientation(sign).numpy()
+        )
         palm.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=MASS)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     return spec
 
 
-def _mounted(sign: int) -> Tensor:
-    """How a hand is turned in ``gripper_link``, a unit quaternion."""
+def _hand_orientation(sign: int) -> Tensor:
+    """Compute how a hand is turned in ``gripper_link``, a unit quaternion."""
     turns = (
         (0.0, -DOWN, 0.0),
         (0.0, 0.0, -sign * OUTWARDS),
