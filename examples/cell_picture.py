@@ -16,7 +16,7 @@ import lerobot_env_bimanual
 from lerobot_env_bimanual.eyes.cells import cell_of
 from tpgmm_vision.cell import cell_from
 from tpgmm_vision.detection.tag_source import TagSource
-from tpgmm_vision.poses import inverse, pose_matrix, transformed
+from tpgmm_vision.poses import inverse, pose_matrix, transform
 
 assert lerobot_env_bimanual  # registers the environments
 #: How much the picture is enlarged before lines are drawn, and the size of it that is kept.
@@ -41,8 +41,8 @@ def drawn(
         for corners in detections.corners.values():
             cv2.polylines(shown, [_pixels(corners)], True, GREEN, 3, cv2.LINE_AA)
     for name, one in found.items():
-        ends = transformed(pose_matrix(one.pose), AXIS * np.eye(4, 3, k=-1))
-        ends = _pixels(front.camera.project(transformed(inverse(front.pose), ends)))
+        ends = transform(pose_matrix(one.pose), AXIS * np.eye(4, 3, k=-1))
+        ends = _pixels(front.camera.project(transform(inverse(front.pose), ends)))
         for end, colour in zip(ends[1:], COLOURS, strict=True):
             cv2.line(shown, ends[0].tolist(), end.tolist(), colour, 4, cv2.LINE_AA)
         for colour, width in (((255,) * 3, 5), ((20,) * 3, 2)):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import inverse, rigid, transformed
+from tpgmm_vision.poses import inverse, rigid, transform
 from tpgmm_vision.targets import FAMILIES, Target, modules_of
 
 CAMERA = Camera(640, 480, (554.0, 556.0), (322.0, 237.0), (0.08, -0.15, 0.0006, -0.0004, 0.0))
@@ -37,7 +37,7 @@ def drawn(
         interpolation=cv2.INTER_CUBIC,
     )  # fmt: skip
     faces = [
-        (transformed(inverse(base_from_camera) @ pose, corners), number, target.family)
+        (transform(inverse(base_from_camera) @ pose, corners), number, target.family)
         for target, pose in things
         for number, corners in target.corners.items()
     ]

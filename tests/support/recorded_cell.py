@@ -13,7 +13,7 @@ from tpgmm_evaluation.policies.inverse_kinematics import reach
 from tpgmm_torch import Frame, Robot
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import camera_content, pose_content
-from tpgmm_vision.poses import Array, inverse, pose_matrix, rigid, transformed
+from tpgmm_vision.poses import Array, inverse, pose_matrix, rigid, transform
 from tpgmm_vision.targets import FAMILIES, Board, Target, cube, modules_of, tag
 
 FPS = 15
@@ -44,7 +44,7 @@ def picture(things: list[tuple[Array, Target]], rng: np.random.Generator) -> np.
     grey = np.full((CAMERA.height, CAMERA.width), 120.0)
     for pose, target in sorted(things, key=lambda one: -(inverse(VIEW) @ one[0])[2, 3]):
         for number, corners in target.corners.items():
-            _draw(grey, transformed(inverse(VIEW) @ pose, corners), target.family, number)
+            _draw(grey, transform(inverse(VIEW) @ pose, corners), target.family, number)
     grey = cv2.GaussianBlur(grey, (0, 0), 0.6) + 2 * rng.standard_normal(grey.shape)
     return np.repeat(grey.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
@@ -151,7 +151,7 @@ def _taken(robot: Robot, rng: np.random.Generator) -> Episode:
     home, at = HOME + 0.03 * rng.standard_normal(6), HOME
     ways = []
     for aside in ((-0.06, 0.0, 0.02), (0.0, 0.0, 0.02), (0.0, 0.0, 0.12)):
-        goal = Frame(transformed(cup, [aside])[0])
+        goal = Frame(transform(cup, [aside])[0])
         at = reach(robot, {LINK: goal}, at, orientations=False).numpy()
         ways.append(at.copy())
     closed = [ways[1].copy(), ways[2].copy()]

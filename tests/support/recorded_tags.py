@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import inverse, pose_vector, rigid, transformed
+from tpgmm_vision.poses import inverse, pose_vector, rigid, transform
 from tpgmm_vision.targets import tag
 
 FPS = 25
@@ -43,7 +43,7 @@ def picture(tags, rng=None):
         texture[MODULE:-MODULE, MODULE:-MODULE] = inside
         corners = tag(number, SIZE).corners[number]
         seen = CAMERA.project(
-            transformed(inverse(BASE_FROM_CAMERA), transformed(base_from_tag, corners))
+            transform(inverse(BASE_FROM_CAMERA), transform(base_from_tag, corners))
         )
         shape = cv2.getPerspectiveTransform(
             edges.astype(np.float32), ((seen + 0.5) * FINE - 0.5).astype(np.float32)

@@ -15,7 +15,7 @@ from tpgmm_torch import Robot
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.tags import Detections
-from tpgmm_vision.poses import Array, inverse, pose_matrix, rigid, transformed
+from tpgmm_vision.poses import Array, inverse, pose_matrix, rigid, transform
 from tpgmm_vision.targets import Target, cube
 
 CAMERA = Camera(640, 480, (554.0, 554.0), (322.5, 237.5), (0.08, -0.15, 0.0006, -0.0004, 0.0))
@@ -48,7 +48,7 @@ def visible(camera: Camera, pose: Array, target: Target) -> dict[int, Array]:
     """Corners of tags that are turned to the camera, in its picture and large enough."""
     found = {}
     for number, points in target.corners.items():
-        local = transformed(pose, points)
+        local = transform(pose, points)
         middle, normal = local.mean(0), np.cross(local[1] - local[0], local[3] - local[0])
         cosine = normal @ middle / np.linalg.norm(normal) / np.linalg.norm(middle)
         if (local[:, 2] < 0.12).any() or cosine < np.cos(np.radians(65)):

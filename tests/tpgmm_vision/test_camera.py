@@ -14,7 +14,7 @@ def test_rays_are_where_points_come_from():
 
 def test_pixels_move_with_points_as_finite_differences_say():
     points = np.array([[0.1, -0.2, 0.8], [0.0, 0.1, 1.5]])
-    pixels, rates = CAMERA.projected(points)
+    pixels, rates = CAMERA.project_with_rates(points)
     for axis in range(3):
         step = 1e-6 * np.eye(3)[axis]
         moved = (CAMERA.project(points + step) - CAMERA.project(points - step)) / 2e-6

@@ -75,9 +75,9 @@ def test_what_is_wrong_is_named(content, message, tmp_path):
 def test_cameras_without_poses_can_be_listed_but_not_used(tmp_path):
     cell = cell_from(changed((*FRONT, "pose"), ...))
     with pytest.raises(DataError, match=r"cameras \['front'\] of the cell have no pose"):
-        cell.placed()
+        cell.require_placed_cameras()
     with pytest.raises(DataError, match="no cameras"):
-        cell_from({}).placed()
+        cell_from({}).require_placed_cameras()
     (tmp_path / "cell.json").write_text("{")
     with pytest.raises(DataError, match="is no JSON file"):
         read_cell(tmp_path / "cell.json")

@@ -10,7 +10,7 @@ from tpgmm_vision.poses import (
     pose_matrix,
     pose_vector,
     rigid,
-    transformed,
+    transform,
 )
 
 
@@ -27,7 +27,7 @@ def test_values_and_matrices_are_the_same_poses():
     )
     assert (pose_vector(poses)[:, 3] >= 0).all()
     points = np.random.default_rng(1).normal(size=(5, 3))
-    back = transformed(inverse(poses[0]), transformed(poses[0], points))
+    back = transform(inverse(poses[0]), transform(poses[0], points))
     np.testing.assert_allclose(back, points, atol=1e-12)
 
 

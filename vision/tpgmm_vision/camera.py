@@ -64,9 +64,9 @@ class Camera:
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (n, 2) of points (n, 3) in the camera's frame [m]."""
-        return self.projected(points)[0]
+        return self.project_with_rates(points)[0]
 
-    def projected(self, points: ArrayLike) -> tuple[Array, Array]:
+    def project_with_rates(self, points: ArrayLike) -> tuple[Array, Array]:
         """Pixels (n, 2) of points (n, 3), and how they move with the points (n, 2, 3)."""
         zero, points = np.zeros(3), np.asarray(points, dtype=float).reshape(-1, 1, 3)
         lens = np.array(self.distortion)
@@ -75,7 +75,7 @@ class Camera:
         return np.asarray(pixels.reshape(-1, 2), dtype=float), np.asarray(moved, dtype=float)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Where the rays of pixels (n, 2) meet the plane z = 1: x and y (n, 2)."""
+        """Intersect the rays of pixels (n, 2) with the plane z = 1: x and y (n, 2)."""
         points = np.asarray(pixels, dtype=float).reshape(-1, 1, 2)
         lens = self.matrix, np.array(self.distortion)
         found = cv2.undistortPointsIter(points, *lens, None, None, ENDS)

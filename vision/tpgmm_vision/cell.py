@@ -178,7 +178,7 @@ class Cell:
         found = (one.link for one in self.cameras.values())
         return tuple(dict.fromkeys(link for link in found if link is not None))
 
-    def placed(self) -> dict[str, CellCamera]:
+    def require_placed_cameras(self) -> dict[str, CellCamera]:
         """The cameras, all of which have a pose.
 
         Raises
@@ -260,11 +260,11 @@ def write_cell(content: Mapping[str, Any], path: str | Path) -> Cell:
     """
     cell = cell_from(content, str(path))
     with replacing(path) as new:
-        new.write_text(_formatted(content), encoding="utf-8")
+        new.write_text(_format_content(content), encoding="utf-8")
     return cell
 
 
-def _formatted(content: Mapping[str, Any]) -> str:
+def _format_content(content: Mapping[str, Any]) -> str:
     """JSON in which lists of numbers take one line each."""
 
     def one_line(found: re.Match[str]) -> str:
@@ -282,8 +282,8 @@ def cell_from(content: Any, where: str = "the cell") -> Cell:
         If it is no cell; the message begins with ``where`` and names the entry.
     """
     made = _entries(content, where, {}, {
-        "cameras": _named(_camera), "objects": _named(_object), "checks": _named(_check),
-        "joint_offsets": _named(_numbers(1)), "joints": _texts, "source": _text,
+        "cameras": _mapping(_camera), "objects": _mapping(_object), "checks": _mapping(_check),
+        "joint_offsets": _mapping(_numbers(1)), "joints": _texts, "source": _text,
     })  # fmt: skip
     cell = Cell(**made, content=content)
     if "joints" in made and (extra := cell.joint_offsets.keys() - set(cell.joints)):
@@ -330,7 +330,7 @@ def _entries(
     return {name: readers[name](value[name], f"{where}: {name}") for name in there}
 
 
-def _named(reader: _Reader) -> _Reader:
+def _mapping(reader: _Reader) -> _Reader:
     """A reader of an object of named entries."""
 
     def read(value: Any, where: str) -> dict[str, Any]:
@@ -375,10 +375,10 @@ def _texts(value: Any, where: str) -> tuple[str, ...]:
 
 
 def _pose(value: Any, where: str) -> Array:
-    return _located(pose_matrix, where, _numbers(7)(value, where))
+    return _make_at(pose_matrix, where, _numbers(7)(value, where))
 
 
-def _located(make: Callable[..., Any], where: str, *given: Any, **options: Any) -> Any:
+def _make_at(make: Callable[..., Any], where: str, *given: Any, **options: Any) -> Any:
     """Value of a function; its errors say where the entry is."""
     try:
         return make(*given, **options)
@@ -398,7 +398,7 @@ def _camera(value: Any, where: str) -> CellCamera:
     lens = _entries(value, where, needed, other)
     size, mount = lens.pop("size"), {n: lens.pop(n, None) for n in ("key", "pose", "link")}
     lens.pop("report", None)
-    return CellCamera(_located(Camera, where, *map(int, size), **lens), **mount)
+    return CellCamera(_make_at(Camera, where, *map(int, size), **lens), **mount)
 
 
 def _object(value: Any, where: str) -> CellObject:

@@ -15,7 +15,7 @@ from tpgmm_torch.exceptions import DataError
 
 __all__ = [
     "Array", "angle_between", "inverse", "mean_pose", "pose_matrix", "pose_vector",
-    "rigid", "transformed",
+    "rigid", "transform",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def inverse(pose: Array) -> Array:
     return back
 
 
-def transformed(pose: Array, points: ArrayLike) -> Array:
+def transform(pose: Array, points: ArrayLike) -> Array:
     """Points (n, 3) of one frame in another [m]."""
     return np.asarray(points, dtype=float) @ pose[:3, :3].T + pose[:3, 3]
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.poses import Array, pose_matrix, transformed
+from tpgmm_vision.poses import Array, pose_matrix, transform
 
 __all__ = [
     "FAMILIES",
@@ -158,7 +158,7 @@ def bundle(
     if not poses:
         raise DataError("a bundle has at least one tag, got none")
     places = {int(number): pose_matrix(pose) for number, pose in poses.items()}
-    return Target({n: transformed(pose, _square(size)) for n, pose in places.items()}, family)
+    return Target({n: transform(pose, _square(size)) for n, pose in places.items()}, family)
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class Watch:
                 "its file, or take poses that are observed otherwise (--policy.cell=none)"
             )
         check_robot(cell, robot)
-        cell.placed()
+        cell.require_placed_cameras()
         self.cell, self.names = cell, tuple(names)
         self._robot, self.sources = robot, [pose_source(cell, robot)]
         self.reset()
@@ -145,11 +145,11 @@ class Watch:
         return stack
 
     def poses(self) -> dict[str, Array]:
-        """Where the objects are seen now (B, 7), NaN where they are not."""
+        """Return the poses of the objects now (B, 7), NaN where they are not seen."""
         return {name: self._recent[-1][:, k] for k, name in enumerate(self.names)}
 
     def first(self) -> dict[str, Array]:
-        """Where the objects are at the start (B, 7), NaN where they were not seen often yet.
+        """Return the poses at the start (B, 7), NaN where not seen often yet.
 
         Raises
         ------

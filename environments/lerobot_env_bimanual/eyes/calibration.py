@@ -17,7 +17,7 @@ from lerobot_env_bimanual.robot_scene import TIMESTEP
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_vision.detection.tags import TagDetector
-from tpgmm_vision.poses import Array, inverse, transformed
+from tpgmm_vision.poses import Array, inverse, transform
 
 __all__ = ["calibration_episode", "chain_of", "varied_postures"]
 
@@ -150,7 +150,7 @@ def _place(rig: Rig, joints: Vector) -> None:
 def _faces(rig: Rig, pose: Array, link: str) -> bool:
     """Check whether a tag is in the picture and faces the camera, hidden or not."""
     corners = np.stack([*rig.carriers[link].target.corners.values()])
-    seen = transformed(pose, corners.reshape(-1, 3)).reshape(corners.shape)
+    seen = transform(pose, corners.reshape(-1, 3)).reshape(corners.shape)
     middle, out = seen.mean(axis=1), np.cross(seen[:, 1] - seen[:, 0], seen[:, 0] - seen[:, 3])
     away = np.linalg.norm(out, axis=1) * np.linalg.norm(middle, axis=1)
     faces = -(out * middle).sum(axis=1) > away * np.cos(np.radians(TURNED))

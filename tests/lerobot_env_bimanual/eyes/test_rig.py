@@ -25,7 +25,7 @@ from lerobot_env_bimanual.suite.env import SuiteEnv
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_vision.cell import cell_from
 from tpgmm_vision.detection.tags import TagDetector
-from tpgmm_vision.poses import inverse, transformed
+from tpgmm_vision.poses import inverse, transform
 
 pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
@@ -48,7 +48,7 @@ def rms_of_corners(rig, picture, camera):
         pose = camera_from_base @ rig.pose(body) @ carrier.pose
         for number, corners in carrier.target.corners.items():
             if number in found:
-                wanted = rig.lens.camera.project(transformed(pose, corners))
+                wanted = rig.lens.camera.project(transform(pose, corners))
                 apart[number] = float(np.sqrt(np.square(found[number] - wanted).mean()))
     return apart
 
@@ -200,7 +200,7 @@ def test_where_nothing_can_be_drawn_that_is_an_error(monkeypatch):
 
 def test_a_view_looks_at_its_point_from_so_far():
     pose = around(CENTRE, 0.8, 30.0, 40.0).pose
-    [seen] = transformed(inverse(pose), [CENTRE])
+    [seen] = transform(inverse(pose), [CENTRE])
     np.testing.assert_allclose(seen, (0, 0, 0.8), atol=1e-12)
     assert pose[2, 3] == pytest.approx(CENTRE[2] + 0.8 * np.sin(np.radians(40)))
     assert abs(pose[2, 0]) < 1e-12, "the horizon is level"

@@ -24,10 +24,10 @@ def test_the_jacobian_is_that_of_small_steps():
     state = problem.state(poses)
     _, offsets, scales = problem.split(state)
     offsets[:], scales[:] = rng.normal(0, 0.05, len(offsets)), rng.normal(0, 0.02, 3)
-    _, jacobian, _ = problem.expected(state)
+    _, jacobian, _ = problem.expect_pixels(state)
     for column, step in enumerate(1e-6 * np.eye(problem.n_steps)):
         after, before = (
-            problem.expected(problem.moved(state, sign * step))[0] for sign in (1, -1)
+            problem.expect_pixels(problem.move_state(state, sign * step))[0] for sign in (1, -1)
         )
         np.testing.assert_allclose(jacobian[..., column], (after - before) / 2e-6, atol=1e-4)
     free = problem.free[problem.offsets]

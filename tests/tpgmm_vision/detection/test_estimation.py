@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.drawn_tags import CAMERA, look_at
 from tpgmm_vision.detection.estimation import View, estimate_pose
-from tpgmm_vision.poses import angle_between, inverse, rigid, transformed
+from tpgmm_vision.poses import angle_between, inverse, rigid, transform
 from tpgmm_vision.targets import cube, tag
 
 EYE = look_at((0.9, 0.3, 0.6), (0.2, 0.0, 0.1))
@@ -16,7 +16,7 @@ def seen(target, pose, rng, base_from_camera=EYE, std=0.05, numbers=None):
     """Corners of those tags that face the camera."""
     corners = {}
     for number, points in target.corners.items():
-        there = transformed(inverse(base_from_camera) @ pose, points)
+        there = transform(inverse(base_from_camera) @ pose, points)
         normal = np.cross(there[1] - there[0], there[3] - there[0])
         facing = normal @ there.mean(0) / np.linalg.norm(normal) / np.linalg.norm(there.mean(0))
         if facing > 0.3 and (numbers is None or number in numbers):

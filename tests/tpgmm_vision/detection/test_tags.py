@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from tests.support.drawn_tags import CAMERA, drawn
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.detection.tags import TagDetector, grey
-from tpgmm_vision.poses import rigid, transformed
+from tpgmm_vision.poses import rigid, transform
 from tpgmm_vision.targets import FAMILIES, tag
 
 FRONT = np.diag([1.0, -1, -1])  # of a tag that faces the camera
@@ -32,7 +32,7 @@ def test_corners_are_found_within_a_tenth_of_a_pixel(blur, noise):
         found = TagDetector(magnify=2)(picture)
         assert found.corners.keys() <= {7}
         if found.corners:
-            expected = CAMERA.project(transformed(pose, target.corners[7]))
+            expected = CAMERA.project(transform(pose, target.corners[7]))
             errors.append(np.linalg.norm(found.corners[7] - expected, axis=1))
             said = np.sqrt(np.trace(found.covariances[7]) / 4)
             assert said < 0.5
@@ -66,7 +66,7 @@ def test_tags_are_found_in_boxes_as_in_the_whole_picture():
 
 def test_what_covers_a_part_of_a_tag_does_not_shift_its_corners():
     rng, target, pose = np.random.default_rng(4), tag(5, 0.06), rigid(FRONT, (0.0, 0.0, 0.7))
-    expected, worst = CAMERA.project(transformed(pose, target.corners[5])), 0.0
+    expected, worst = CAMERA.project(transform(pose, target.corners[5])), 0.0
     for _ in range(40):
         picture = drawn(CAMERA, np.eye(4), [(target, pose)], rng)
         x, y = rng.uniform(expected.min(0), expected.max(0)).astype(int).tolist()

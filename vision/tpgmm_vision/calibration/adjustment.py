@@ -66,7 +66,7 @@ class Adjustment:
     jacobian: Array
 
     def covariance(self) -> Array:
-        """Of the entries of a step (n_steps, n_steps), zero where they are not free."""
+        """Compute the covariance of a step (n_steps, n_steps), zero where it is not free."""
         free, found = self.problem.free, np.zeros((self.problem.n_steps,) * 2)
         weak = np.zeros(len(free))
         weak[: self.problem.offsets.start] = np.tile(
@@ -122,14 +122,14 @@ def adjust(
         whitening = _whitening(problem, state, found, weights)
 
         def residual(points: Tensor) -> tuple[Tensor, Tensor]:
-            left, jacobian = _whitened(problem, points[0].numpy(), whitening)  # noqa: B023
+            left, jacobian = _whiten(problem, points[0].numpy(), whitening)  # noqa: B023
             free = jacobian[:, problem.free]
             return torch.as_tensor(left)[None], torch.as_tensor(free)[None]
 
         def retract(points: Tensor, step: Tensor) -> Tensor:
             whole = np.zeros(problem.n_steps)
             whole[problem.free] = step[0].numpy()
-            return torch.as_tensor(problem.moved(points[0].numpy(), whole))[None]
+            return torch.as_tensor(problem.move_state(points[0].numpy(), whole))[None]
 
         points, _ = levenberg_marquardt(residual, torch.as_tensor(state)[None], STEPS, retract)
         state = points[0].numpy()
@@ -140,13 +140,13 @@ def adjust(
         if abs(last - surprise) < SMALL_CHANGE:
             break
         last = surprise
-    left, jacobian = _whitened(problem, state, _whitening(problem, state, found, weights))
+    left, jacobian = _whiten(problem, state, _whitening(problem, state, found, weights))
     return Adjustment(problem, state, found, misfit, left, jacobian)
 
 
 def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
-    """How far corners are from where they are expected (N, 2), and its Jacobian."""
-    pixels, jacobian, _ = problem.expected(state)
+    """Compute the errors of corners (N, 2) [pixels], and their Jacobian."""
+    pixels, jacobian, _ = problem.expect_pixels(state)
     return problem.corners.pixels - pixels, jacobian
 
 
@@ -170,27 +170,27 @@ def _whitening(
 
 
 def _starts(problem: Reprojection) -> Integers:
-    """Where the corners of each posture begin, and their number."""
+    """Return where the corners of each posture begin, and their number."""
     postures = problem.corners.posture
     changes = np.flatnonzero(np.diff(postures)) + 1
     return np.concatenate(([0], changes, [len(postures)]))
 
 
-def _whitened(
+def _whiten(
     problem: Reprojection, state: Array, whitening: list[tuple[slice, Array]]
 ) -> tuple[Array, Array]:
     """Errors in units of their noise, and how steps lessen them."""
     errors, jacobian = _errors(problem, state)
     table = np.column_stack((errors.ravel(), jacobian.reshape(errors.size, -1)))
     table = np.concatenate([root @ table[own] for own, root in whitening])
-    known, priors = _known(problem, state)
+    known, priors = _prior_terms(problem, state)
     prior = np.zeros((len(known), problem.n_steps))
     prior[:, problem.offsets.start :] = np.diag(1 / priors)
     left = np.concatenate((table[:, 0], -known / priors))
     return left, np.concatenate((table[:, 1:], prior))
 
 
-def _known(problem: Reprojection, state: Array) -> tuple[Array, Array]:
+def _prior_terms(problem: Reprojection, state: Array) -> tuple[Array, Array]:
     """Offsets and scales, and their standard deviations before what is seen tells."""
     counts = problem.robot.n_joints, len(problem.cameras) + 1
     return state[16 * problem.n_poses :], np.repeat((OFFSET_PRIOR, SCALE_PRIOR), counts)
@@ -214,7 +214,7 @@ def _noise(
         start, bounds = np.log([0.3, np.radians(0.5)]), np.log([PIXELS, JOINTS])
         logs = minimize(surprise, start, method="Nelder-Mead", bounds=bounds).x
         given = Noise(*np.exp(logs).tolist())
-    known, priors = _known(problem, state)
+    known, priors = _prior_terms(problem, state)
     least = surprise(np.log([given.pixels, given.joints])) + ((known / priors) ** 2).sum() / 2
     return given, float(least)
 

@@ -233,7 +233,7 @@ class _Task:
         """The state by closed forms, pair by pair of a camera and a target."""
         problem, n, known = self.problem, len(self.cameras), dict[int, Array]()
         bases = np.tile(np.eye(4), (len(self.bases), 1, 1))
-        links, unplaced = problem.placed(problem.nothing)[0], set(range(len(bases)))
+        links, unplaced = problem.place_links(problem.nothing)[0], set(range(len(bases)))
 
         def order(pair: tuple[int, int]) -> tuple[bool, bool, bool, int]:
             i, target = pair[0], n + pair[1]
@@ -311,7 +311,7 @@ class _Task:
         middles = np.zeros((len(at), 3))
         corners = Corners(middles[:, :2], middles, at, i, j, at)
         other = replace(problem, joints=problem.joints.mean(0) + away, corners=corners)
-        _, _, seen = other.expected(fit.state)
+        _, _, seen = other.expect_pixels(fit.state)
         errors = np.einsum("nij,jk,nik->n", seen, fit.covariance(), seen) ** 0.5
         expected = np.median(errors.reshape(len(pairs), -1), axis=1)
         if (worst := float(expected.max())) > LARGEST_EXPECTED:
@@ -323,7 +323,7 @@ class _Task:
     def _missing(self, i: int, j: int) -> str:
         """Variety that postures lack."""
         problem, part = self.problem, self.problem.links[len(self.cameras) + j]
-        links, jacobians = problem.placed(problem.nothing)
+        links, jacobians = problem.place_links(problem.nothing)
         used = self.views[i, j][0]
         turns = Rotation.from_matrix(links[used, part, :3, :3])
         vectors = (turns * turns.mean().inv()).as_rotvec()
@@ -345,7 +345,7 @@ class _Task:
         )  # fmt: skip
 
     def scales(self, fit: Adjustment) -> tuple[str, ...]:
-        """Whether another focal length or size of tags explains clearly more, and which."""
+        """Find focal lengths or sizes of tags that explain clearly more if changed."""
         found = list[tuple[float, str]]()
         for number, column in enumerate(fit.jacobian.T[fit.problem.scales]):
             gain, [value], [spread] = fit.gain(column[:, None])
@@ -371,7 +371,7 @@ class _Task:
         for fold in range(FOLDS):
             corners = problem.corners.of(problem.corners.posture % FOLDS != fold)
             part = adjust(replace(problem, corners=corners), fit.state, fit.noise)
-            placed = problem.carried(part.state)
+            placed = problem.place_carried(part.state)
             for (i, j), (postures, poses) in self.views.items():
                 if problem.links[i] == problem.links[n + j]:
                     continue  # which stand still to one another, no hand among them
@@ -384,7 +384,7 @@ class _Task:
             dict(zip(names[moves].tolist(), values[moves].tolist(), strict=True))
             for values in (offsets, spread)
         )
-        pixels, c = self.problem.expected(fit.state)[0], self.problem.corners
+        pixels, c = self.problem.expect_pixels(fit.state)[0], self.problem.corners
         expected = defaultdict[tuple[str, int], dict[int, Array]](dict)
         for k in range(0, len(pixels), 4):
             place = self.cameras[c.camera[k]], int(c.posture[k])

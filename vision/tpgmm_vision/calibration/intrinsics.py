@@ -100,13 +100,13 @@ def calibrate_camera(
     size = next(iter(sizes.values()))
     _check_covered(views, size)
     fixed = cv2.CALIB_FIX_K3
-    worst = _fitted(views, size, fixed)[1]
+    worst = _fit_camera(views, size, fixed)[1]
     limit = BLURRED * np.median([*worst.values()])
     blurred = [name for name, error in worst.items() if error > limit]
     views = {name: view for name, view in views.items() if name not in blurred}
     errors = {flags: _left_out(views, size, flags) for flags in (fixed, 0)}
     flags = 0 if errors[0] < HELPS * errors[fixed] else fixed
-    camera, _, turns, uncertain = _fitted(views, size, flags)
+    camera, _, turns, uncertain = _fit_camera(views, size, flags)
     sides = Rotation.from_rotvec(turns).as_matrix()[:, :, 2]
     tilt = float(np.sqrt(sides.var(axis=0).sum()))
     if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
@@ -160,7 +160,7 @@ def _check_covered(views: Views, size: Sequence[int]) -> None:
         )
 
 
-def _fitted(
+def _fit_camera(
     views: Views, size: Sequence[int], flags: int
 ) -> tuple[Camera, dict[str, float], Array, float]:
     """Camera, error of each picture [pixels], rotations, and the share of f that is unsure."""
@@ -181,7 +181,7 @@ def _left_out(views: Views, size: Sequence[int], flags: int) -> float:
     squares, names = list[Array](), list(views)
     for fold in range(FOLDS):
         kept = {n: views[n] for k, n in enumerate(names) if k % FOLDS != fold}
-        camera, *_ = _fitted(kept, size, flags)
+        camera, *_ = _fit_camera(kept, size, flags)
         for name in names[fold::FOLDS]:
             points, pixels = views[name]
             lens = camera.matrix, np.array(camera.distortion)

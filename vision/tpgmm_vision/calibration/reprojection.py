@@ -93,12 +93,12 @@ class Reprojection:
         if not len(self.free):
             free = np.ones(self.n_steps, dtype=bool)
             object.__setattr__(self, "free", free)
-            jacobians = np.abs(self.placed(self.nothing)[1][:, self.links])
+            jacobians = np.abs(self.place_links(self.nothing)[1][:, self.links])
             free[self.offsets], free[self.scales] = jacobians.max((0, 1, 2)) > 1e-9, False
 
     @property
     def n_poses(self) -> int:
-        """How many poses are in the state."""
+        """Number of poses in the state."""
         return len(self.carriers) + len(self.bases)
 
     @property
@@ -108,12 +108,12 @@ class Reprojection:
 
     @property
     def offsets(self) -> slice:
-        """Where offsets of joints are in a step."""
+        """Entries of a step that are offsets of joints."""
         return slice(6 * self.n_poses, 6 * self.n_poses + self.robot.n_joints)
 
     @property
     def scales(self) -> slice:
-        """Where scales are in a step: of focal lengths, then that of tags."""
+        """Entries of a step that are scales: of focal lengths, then that of tags."""
         return slice(self.offsets.stop, None)
 
     def state(self, poses: Array) -> Array:
@@ -131,7 +131,7 @@ class Reprojection:
         offsets, scales = np.split(rest, [self.robot.n_joints])
         return poses.reshape(-1, 4, 4), offsets, scales
 
-    def moved(self, state: Array, step: Array) -> Array:
+    def move_state(self, state: Array, step: Array) -> Array:
         """A state after a step: poses of cameras and targets in their own axes."""
         poses, *_ = self.split(state)
         turns = [rigid(one[3:], one[:3]) for one in step[: self.offsets.start].reshape(-1, 6)]
@@ -141,7 +141,7 @@ class Reprojection:
         changed = state[16 * self.n_poses :] + step[self.offsets.start :]
         return np.concatenate((np.ravel(after), changed))
 
-    def placed(self, state: Array, joints: Array | None = None) -> tuple[Array, Array]:
+    def place_links(self, state: Array, joints: Array | None = None) -> tuple[Array, Array]:
         """Poses of all links, and one that stands still, in the base frame, and Jacobians.
 
         Returns
@@ -161,13 +161,13 @@ class Reprojection:
             links[:, own], jacobians[:, own] = base @ links[:, own], turn @ jacobians[:, own]
         return links, jacobians
 
-    def carried(self, state: Array, joints: Array | None = None) -> Array:
+    def place_carried(self, state: Array, joints: Array | None = None) -> Array:
         """Poses (n, n_cameras + n_targets, 4, 4) of cameras and targets in the base frame."""
         n = len(self.carriers)
-        return self.placed(state, joints)[0][:, self.links] @ self.split(state)[0][:n]
+        return self.place_links(state, joints)[0][:, self.links] @ self.split(state)[0][:n]
 
-    def expected(self, state: Array) -> tuple[Array, Array, Array]:
-        """Where the corners are seen, and how steps and joints move them.
+    def expect_pixels(self, state: Array) -> tuple[Array, Array, Array]:
+        """Predict the pixels of corners, and how steps and joints move them.
 
         Returns
         -------
@@ -177,7 +177,7 @@ class Reprojection:
             The Jacobian of the points in their cameras' frames.
         """
         c, (poses, _, scales) = self.corners, self.split(state)
-        (links, jacobians), rows = self.placed(state), np.arange(len(self.corners.pixels))
+        (links, jacobians), rows = self.place_links(state), np.arange(len(self.corners.pixels))
         of = np.stack((c.camera, len(self.cameras) + c.target))
         camera, target = links[c.posture, self.links[of]] @ poses[of]
         points = c.points * np.exp(scales[-1])
@@ -206,7 +206,7 @@ class Reprojection:
             own, scale = c.camera == number, np.exp(scales[number])
             if not own.any():
                 continue
-            found, rates = one.projected(local[own])
+            found, rates = one.project_with_rates(local[own])
             away = scale * (found - one.principal_point)
             pixels[own], jacobian[own] = away + one.principal_point, scale * rates @ seen[own]
             jacobian[own, :, self.scales.start + number] = away

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, angle_between, inverse, rigid, transformed
+from tpgmm_vision.poses import Array, angle_between, inverse, rigid, transform
 from tpgmm_vision.targets import Target
 
 __all__ = ["PoseEstimate", "View", "estimate_pose"]
@@ -71,7 +71,7 @@ class PoseEstimate:
         Of its position [m^2] and, as a rotation vector in the base frame, of its orientation
         [rad^2].
     residual : float
-        Of the corners, root mean square [pixels].
+        Compute the root mean square error of the corners [pixels].
     valid : bool
     reason : str
         Why it is not valid.
@@ -126,7 +126,7 @@ def estimate_pose(
         fit = fit or problem.best(None)
         wrong = problem.contradicts(fit)
         if not wrong or len(problem.tags) == 1:
-            return problem.judged(fit, wrong)
+            return problem.judge_fit(fit, wrong)
         problem = problem.without(problem.worst(fit.pose))
     return None
 
@@ -176,7 +176,7 @@ class _Seen:
 
     def errors(self, pose: Array) -> Array:
         """Expected less seen corners (n, 4, 2) [pixels]."""
-        points = transformed(self._from_base @ pose, self.points.reshape(-1, 3))
+        points = transform(self._from_base @ pose, self.points.reshape(-1, 3))
         return self.view.camera.project(points).reshape(-1, 4, 2) - self.pixels
 
     @cached_property
@@ -187,10 +187,10 @@ class _Seen:
         """The errors (n, 8) in standard deviations, and how the pose moves them (n, 8, 6)."""
         n, camera_from_base = len(self.numbers), self._from_base
         turned = self.points.reshape(-1, 3) @ pose[:3, :3].T
-        points = transformed(camera_from_base, turned + pose[:3, 3])
+        points = transform(camera_from_base, turned + pose[:3, 3])
         if (points[:, 2] < 1e-3).any():  # behind the camera
             return np.full((n, 8), 1e3), np.zeros((n, 8, 6))
-        pixels, rates = self.view.camera.projected(points)
+        pixels, rates = self.view.camera.project_with_rates(points)
         rates = rates @ camera_from_base[:3, :3]
         (x, y, z), zero = turned.T, np.zeros(len(turned))
         # d (w x p) / d w = -[p]x
@@ -219,7 +219,7 @@ class _Problem:
 
     @property
     def freedom(self) -> int:
-        """How many numbers are known beyond those of a pose."""
+        """Number of measurements beyond those of a pose."""
         return 8 * sum(len(one.numbers) for one in self.seen) - 6
 
     def without(self, number: int) -> _Problem:
@@ -240,19 +240,19 @@ class _Problem:
         guesses = [pose for one in self.seen for pose in _hypotheses(one)]
         costs = [self.system(pose, known)[0] for pose in guesses]
         order = np.argsort(costs)
-        first = self.descended(guesses[order[0]], known)
+        first = self.descend(guesses[order[0]], known)
         rivals = [
             guesses[k] for k in order[1:] if angle_between(guesses[k], first.pose) > DISTINCT
         ]
         if rivals:
-            other = self.descended(rivals[0], known)
+            other = self.descend(rivals[0], known)
             if angle_between(other.pose, first.pose) > DISTINCT:
                 if other.cost < first.cost:
                     first, other = other, first
                 return replace(first, second=other)
         return first
 
-    def descended(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
+    def descend(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
         """Gauss-Newton with damping."""
         damping = 1e-3
         cost, gradient, information = self.system(pose, known)
@@ -299,19 +299,19 @@ class _Problem:
         return float(residual @ residual), rates.T @ residual, rates.T @ rates
 
     def residual(self, pose: Array) -> float:
-        """Of the corners, root mean square [pixels]."""
+        """Compute the root mean square error of the corners [pixels]."""
         errors = np.concatenate([one.errors(pose) for one in self.seen])
         return float(np.sqrt(np.square(errors).sum(-1).mean()))
 
     def contradicts(self, fit: _Fit) -> bool:
-        """Whether the corners are not where they should be."""
+        """Test whether the corners are not where they should be."""
         edges = [
             np.linalg.norm(one.pixels[:, 1] - one.pixels[:, 0], axis=1) for one in self.seen
         ]
         bound = CRAFT * float(np.median(np.concatenate(edges)))
         return fit.cost > MOST_MISFIT**2 * self.freedom and self.residual(fit.pose) > bound
 
-    def judged(self, fit: _Fit, wrong: bool) -> PoseEstimate:
+    def judge_fit(self, fit: _Fit, wrong: bool) -> PoseEstimate:
         """The pose, whether it can be trusted, and if not why."""
         misfit = fit.cost / self.freedom
         inverse_information = np.linalg.pinv(fit.information, hermitian=True)

@@ -20,7 +20,7 @@ from tpgmm_vision.poses import (
     inverse,
     pose_matrix,
     pose_vector,
-    transformed,
+    transform,
 )
 from tpgmm_vision.sources import ObservedPose
 from tpgmm_vision.targets import Target
@@ -65,7 +65,7 @@ class TagSource:
     """
 
     def __init__(self, cell: Cell, robot: Kinematics | None = None) -> None:
-        self._cameras = cell.placed()
+        self._cameras = cell.require_placed_cameras()
         if not cell.objects:
             raise DataError('the cell has no objects: add them to its file under "objects"')
         check_robot(cell, robot)
@@ -73,7 +73,7 @@ class TagSource:
         # in the frame of the object, so that its axis and its height are those of the pose
         self._targets = {
             name: Target(
-                {n: transformed(inverse(one.pose), c) for n, c in one.target.corners.items()},
+                {n: transform(inverse(one.pose), c) for n, c in one.target.corners.items()},
                 one.target.family,
             )
             for name, one in cell.objects.items()
@@ -120,7 +120,7 @@ class TagSource:
             if one.key not in images:
                 raise UnknownNameError("picture", one.key, "the observation", images)
             one.camera.check(images[one.key], name)
-            self.detections[name] = self._detected(name, images[one.key])
+            self.detections[name] = self._detect_tags(name, images[one.key])
         self._check(places)
         found = {name: self._object(name, places, time) for name in self._targets}
         self._boxes = {
@@ -128,7 +128,7 @@ class TagSource:
         }
         return found
 
-    def _detected(self, name: str, picture: NDArray[np.uint8]) -> dict[str, Detections]:
+    def _detect_tags(self, name: str, picture: NDArray[np.uint8]) -> dict[str, Detections]:
         """Tags in a picture: near where they were, or everywhere if that is not all."""
         before, boxes = self.detections.get(name, {}), self._boxes.get(name)
         found = {f: detect(picture, boxes) for f, detect in self._detectors.items()}
@@ -187,12 +187,12 @@ class TagSource:
         self.problem = "; ".join(self._problems.values())
 
     def _check_error(self, name: str, one: CellCamera, place: Array) -> float | None:
-        """How far from where they are checks are seen across the line of sight [m]."""
+        """Measure how far off checks are seen, across the line of sight [m]."""
         errors = []
         for known in self._cell.checks.values():
             seen = self.detections[name][known.target.family].corners
             for number in seen.keys() & known.target.corners.keys():
-                points = transformed(inverse(place) @ known.pose, known.target.corners[number])
+                points = transform(inverse(place) @ known.pose, known.target.corners[number])
                 away = np.linalg.norm(one.camera.project(points) - seen[number], axis=1)
                 depth = float(points[:, 2].mean())
                 errors.append(float(np.median(away)) * depth / min(one.camera.focal_length))
@@ -216,7 +216,7 @@ class TagSource:
     def _around(
         self, name: str, one: CellCamera, places: Mapping[str, Array]
     ) -> list[tuple[int, int, int, int]] | None:
-        """Where tags are looked for next; everywhere (None) unless all objects are seen."""
+        """Choose where to look for tags; everywhere (None) unless all objects are seen."""
         seen = [name for name, found in self.estimates.items() if found.valid]
         if len(seen) < len(self._targets):
             return None
@@ -225,7 +225,7 @@ class TagSource:
         found += [(check.target, check.pose) for check in self._cell.checks.values()]
         for target, pose in found:
             corners = np.concatenate(list(target.corners.values()))
-            points = transformed(camera_from_base @ pose, corners)
+            points = transform(camera_from_base @ pose, corners)
             if (points[:, 2] < 0.01).any():
                 continue
             pixels = one.camera.project(points)
@@ -267,7 +267,7 @@ def camera_poses(
             pose = torch.cat((state.position(link), state.orientation(link)), dim=-1)
             links[link] = pose_matrix(pose[0].double().cpu().numpy())
     placed = {}
-    for name, one in cell.placed().items():
+    for name, one in cell.require_placed_cameras().items():
         assert one.pose is not None
         placed[name] = one.pose if one.link is None else links[one.link] @ one.pose
     return placed

@@ -123,7 +123,7 @@ class TagDetector:
                 if number in rough and np.abs(rough[number] - corners).max() > 2:
                     twice.add(number)
                 rough.setdefault(number, corners)
-        found = {n: self._refined(image, n, c) for n, c in rough.items() if n not in twice}
+        found = {n: self._refine(image, n, c) for n, c in rough.items() if n not in twice}
         good = {n: one for n, one in found.items() if one is not None}
         return Detections(
             {n: one[0] for n, one in good.items()},
@@ -152,7 +152,7 @@ class TagDetector:
             self._patterns[number] = np.asarray(white / 255, dtype=np.float32)
         return self._patterns[number]
 
-    def _refined(
+    def _refine(
         self, image: NDArray[np.uint8], number: int, corners: Array
     ) -> tuple[Array, Array] | None:
         """Corners and their covariance; None where the pattern does not fit."""
@@ -189,7 +189,7 @@ class _Fit:
         self.blur = BLUR * np.eye(2)
         self.x, self.y = (u - self.centre[0]) / self.scale, (v - self.centre[1]) / self.scale
 
-    def predicted(self, corners: Array) -> NDArray[np.float32]:
+    def predict_pixels(self, corners: Array) -> NDArray[np.float32]:
         """The pattern as it is seen with its corners there."""
         height, width = self.patch.shape
         fine = 3 if max(height, width) < 64 else 2 if max(height, width) < 200 else 1
@@ -213,7 +213,7 @@ class _Fit:
         if len(values) < LEAST_PIXELS:
             return None
         for _ in range(STEPS):
-            seen = self.predicted(corners)
+            seen = self.predict_pixels(corners)
             # first and second derivatives along x and y
             orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
             gx, gy, xx, xy, yy = (
@@ -234,8 +234,8 @@ class _Fit:
             normal, residual = system @ system.T, values - shades @ light
             normal[np.diag_indices_from(normal)] *= 1 + 1e-9
             step = np.linalg.solve(normal, system @ residual)
-            corners, moved = self._moved(corners, step[:8])
-            self._blurred(step[8:11])
+            corners, moved = self._move_corners(corners, step[:8])
+            self._update_blur(step[8:11])
             if moved < SMALL_STEP:
                 break
         left = residual - step @ system
@@ -249,20 +249,20 @@ class _Fit:
             return None
         return corners, covariance
 
-    def _moved(self, corners: Array, step: Array) -> tuple[Array, float]:
+    def _move_corners(self, corners: Array, step: Array) -> tuple[Array, float]:
         """Corners after a projective motion in coordinates of the patch, and the furthest."""
         motion = np.eye(3) + np.append(step, 0).reshape(3, 3)
         points = np.column_stack(((corners - self.centre) / self.scale, np.ones(4))) @ motion.T
         new = points[:, :2] / points[:, 2:] * self.scale + self.centre
         return new, float(np.abs(new - corners).max())
 
-    def _blurred(self, step: Array) -> None:
+    def _update_blur(self, step: Array) -> None:
         """Change the blur, within what a picture may have."""
         values, axes = np.linalg.eigh(self.blur + step[[0, 1, 1, 2]].reshape(2, 2))
         self.blur = axes * np.clip(values, LEAST_BLUR, MOST_BLUR) @ axes.T
 
     def _rates(self, corners: Array) -> Array:
-        """How corners move with the motion (8, 8)."""
+        """Compute the Jacobian of the corners by the motion (8, 8)."""
         (u, v), zero, one = ((corners - self.centre) / self.scale).T, np.zeros(4), np.ones(4)
         rows = np.empty((4, 2, 8))
         rows[:, 0] = np.stack((u, v, one, zero, zero, zero, -u * u, -u * v), axis=1)

@@ -52,7 +52,7 @@ class Tracker:
         self._rivals: list[PoseEstimate] = []
 
     def update(self, found: PoseEstimate | None, time: float, reason: str = "") -> Track | None:
-        """Where the object is now.
+        """Update the pose of the object.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class Tracker:
         Track or None
             None before it was ever seen.
         """
-        found = self._resolved(found, time)
+        found = self._resolve_pose(found, time)
         if found is None or not found.valid:
             return self._missing(time, reason if found is None else found.reason)
         if self._last is not None and not self._reachable(found, time):
@@ -79,7 +79,7 @@ class Tracker:
         self._last = Track(found.pose, found.covariance, time, True)
         return self._last
 
-    def _resolved(self, found: PoseEstimate | None, time: float) -> PoseEstimate | None:
+    def _resolve_pose(self, found: PoseEstimate | None, time: float) -> PoseEstimate | None:
         """The one of two poses that follows what was seen shortly before."""
         last = self._last
         if found is None or found.alternative is None or last is None:
@@ -94,7 +94,7 @@ class Tracker:
         return replace(near, valid=True, reason="") if clear else found
 
     def _reachable(self, found: PoseEstimate, time: float) -> bool:
-        """Whether the object can have come there from where it was."""
+        """Test whether the object can have come there from where it was."""
         assert self._last is not None
         passed = max(time - self._last.seen, 0)
         away = float(np.linalg.norm(found.pose[:3, 3] - self._last.pose[:3, 3]))
@@ -110,6 +110,6 @@ class Tracker:
 
 
 def _agree(one: PoseEstimate, other: PoseEstimate) -> bool:
-    """Whether two poses may be those of an object at rest."""
+    """Test whether two poses may be those of an object at rest."""
     away = float(np.linalg.norm(one.pose[:3, 3] - other.pose[:3, 3]))
     return away < SPREAD and angle_between(one.pose, other.pose) < SPREAD_ANGLE

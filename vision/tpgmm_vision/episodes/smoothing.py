@@ -146,7 +146,7 @@ class Track:
             self._fill(gap, _between(self.time[a : b + 1], ends))
         else:
             self.poses[gap] = ends[0]
-            found = [self._carried(hand, a, b) for hand in hands.values()]
+            found = [self._explain_gap(hand, a, b) for hand in hands.values()]
             nothing = np.inf, a, b, ends
             off, taken, put, poses = min(found, key=lambda one: one[0], default=nothing)
             if off <= SLIP:
@@ -154,8 +154,8 @@ class Track:
                 self._fill(slice(a + 1, taken + 1), ends[0])
                 self._fill(slice(put, b), ends[1])
 
-    def _carried(self, hand: Array, a: int, b: int) -> tuple[float, int, int, Array]:
-        """How well a hand explains a gap, from and to when it carried, and the poses then."""
+    def _explain_gap(self, hand: Array, a: int, b: int) -> tuple[float, int, int, Array]:
+        """Score how well a hand explains a gap; from and to when it carried, and the poses."""
         taken, before = self._grasps(hand, a, np.arange(a, b), -1)
         put, after = self._grasps(hand, b, np.arange(a + 1, b + 1), 1)
         away = cdist(_points(before), _points(after))

@@ -29,7 +29,7 @@ from tpgmm_vision.detection.tag_source import camera_poses
 from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import EpisodePictures
-from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transformed
+from tpgmm_vision.poses import Array, inverse, pose_matrix, pose_vector, transform
 from tpgmm_vision.sources import pose_source
 
 __all__ = ["track_lerobot"]
@@ -136,7 +136,9 @@ class _Tracker:
 
     def __init__(self, layout: Layout, cell: Cell, robot: Any, progress: Any) -> None:
         self.cell, self.robot, self.source = cell, robot, pose_source(cell, robot)
-        self.pictures = EpisodePictures(layout, [one.key for one in cell.placed().values()])
+        self.pictures = EpisodePictures(
+            layout, [one.key for one in cell.require_placed_cameras().values()]
+        )
         self.progress, self.done = progress or (lambda done, total: None), 0
         self.total = sum(episode.length for episode in layout.episodes)
 
@@ -157,7 +159,7 @@ class _Tracker:
         wanted = report.rows_to_show()
         for row, images in self.pictures.read(rows.episode, rows.time, wanted):
             for name, place in camera_poses(self.cell, self.robot, named[row]).items():
-                expected = self._expected(report, row, name, place)
+                expected = self._expect_corners(report, row, name, place)
                 picture = images[self.cell.cameras[name].key]
                 said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
                 seen = detected[row].get(name, {})
@@ -198,15 +200,15 @@ class _Tracker:
         poses = torch.cat((state.positions, state.orientations), -1).double().numpy()
         return dict(zip(robot.links, pose_matrix(poses).swapaxes(0, 1), strict=True))
 
-    def _expected(
+    def _expect_corners(
         self, report: EpisodeReport, row: int, camera: str, place: Array
     ) -> dict[int, Array]:
-        """Where a camera should see the corners of tags that do not look away from it."""
+        """Predict the pixels of the tags that do not look away from a camera."""
         expected = dict[int, Array]()
         for name, thing in self.cell.objects.items():
             pose = inverse(place) @ report.tracks[name].poses[row] @ inverse(thing.pose)
             for number, corners in thing.target.corners.items():
-                points = transformed(pose, corners)
+                points = transform(pose, corners)
                 pixels = self.cell.cameras[camera].camera.project(points)
                 if cv2.contourArea(pixels.astype(np.float32), True) > 0 < points[:, 2].min():
                     expected[number] = pixels

@@ -124,7 +124,7 @@ class EpisodePictures:
             batch_size=IMAGE_ROWS, batch_readahead=1,
         )  # fmt: skip
         for stored in (one for batch in batches for one in batch[key].to_pylist()):
-            yield _decoded(stored, root, where)
+            yield _decode_image(stored, root, where)
             count += 1
         if count != len(time):
             raise _unlike(f"there are {count} images for {len(time)} rows", where)
@@ -154,7 +154,7 @@ def frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[fl
         raise DatasetError(message, check="missing", **where) from error
 
 
-def _decoded(stored: Any, root: Path, where: dict[str, Any]) -> Picture:
+def _decode_image(stored: Any, root: Path, where: dict[str, Any]) -> Picture:
     """A picture as LeRobot stores images: bytes of a file, or its path."""
     content, path = (stored or {}).get("bytes"), (stored or {}).get("path")
     file = (root / (path or "")).resolve()
