@@ -1,4 +1,4 @@
-"""ACT, Diffusion Policy and a perceptron, trained from memory until they stop improving."""
+"""ACT and Diffusion Policy, trained from memory until they stop improving."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies import ACTConfig, DiffusionConfig, PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
 from lerobot.processor import make_default_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -19,8 +20,6 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import state_features
 from tpgmm_evaluation.policies.elapsed_time import tell_time
 from tpgmm_evaluation.policies.episodes import Episodes, Windows, policy_stride
-from tpgmm_evaluation.policies.perceptron import PerceptronConfig
-from tpgmm_evaluation.policy_classes import policy_class
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["RECIPES", "Recipe", "Training", "train"]
@@ -117,8 +116,7 @@ DIFFUSION = Recipe(
     },
     "MIN_MAX",
 )
-PERCEPTRON = Recipe(PerceptronConfig, {}, "MEAN_STD")
-PLAIN = {"act": ACT, "act-large": ACT_LARGE, "diffusion": DIFFUSION, "mlp": PERCEPTRON}
+PLAIN = {"act": ACT, "act-large": ACT_LARGE, "diffusion": DIFFUSION}
 RECIPES = {
     name: recipe
     for kind, plain in PLAIN.items()
@@ -189,7 +187,7 @@ def train(
     if recipe.phase:
         training, validation = (episodes.with_time() for episodes in (training, validation))
     config = _configure(recipe, training)
-    policy = policy_class(config)(config)
+    policy = get_policy_class(config.type)(config)
     processors = make_default_pre_post_processors(config, _statistics(training))
     preprocessor, postprocessor = processors
     result = Training(policy, processors, recipe.rate, recipe.describe())

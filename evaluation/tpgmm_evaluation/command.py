@@ -69,9 +69,9 @@ def compare(
     policies : ``NAME,...``
         Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, as in 0.1.0),
         tpgmm-even-clock, tpgmm-places (objects are where they were at first),
-        tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, key-poses-posture, dmp,
-        promp; act, act-large (LeRobot's sizes), diffusion, mlp, knn, each also with the time,
-        -phase; nearest, mean; all, of tpgmm with all parts and without orientation, of act the
+        tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, key-poses-posture; act,
+        act-large (LeRobot's sizes), diffusion, each also with the time, -phase; nearest,
+        mean; all, of tpgmm with all parts and without orientation, of act the
         small one; or quick: of these, all that no gradient trains. A tpgmm may have settings:
         'tpgmm --policy.FIELD=VALUE'. Beside disturbances the open loop is always there.
     demonstrations : ``N,...``

@@ -29,7 +29,7 @@ POLICIES = tuple(TRAININGS)
 RECORD = "training.json"
 PACKAGES = (
     *("tpgmm-torch", "lerobot", "torch", "numpy", "scikit-learn", "gymnasium", "mujoco"),
-    *("diffusers", "mink", "movement_primitives"),
+    *("diffusers", "mink"),
 )
 
 

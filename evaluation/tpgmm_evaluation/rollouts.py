@@ -17,13 +17,18 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
-from tpgmm_evaluation.policy_classes import policy_class
+from tpgmm_evaluation.policies.replay import NearestPolicy
+from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 
 __all__ = ["Runner", "evaluate", "latency"]
 
+#: Policies of this package, which LeRobot does not find by the type of a configuration.
+BASELINES: dict[str, Any] = {
+    kind.name: kind for kind in (KeyPosesPolicy, MeanPolicy, NearestPolicy)
+}
 #: Environments that are stepped together.
 BATCH = 50
 #: Actions whose time is taken, after as many to warm up as ``WARM_UP``.
@@ -43,7 +48,8 @@ class Runner:
         """Read a pretrained directory as LeRobot does, with ``--field=value`` on top."""
         config = PreTrainedConfig.from_pretrained(directory, cli_overrides=list(overrides))
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it loads
-            policy = policy_class(config).from_pretrained(directory, config=config)
+            kind = BASELINES.get(config.type) or get_policy_class(config.type)
+            policy = kind.from_pretrained(directory, config=config)
         return cls(policy, *make_pre_post_processors(config, pretrained_path=str(directory)))
 
     def reset(self) -> None:

@@ -36,20 +36,12 @@ DESCRIPTIONS = {
     "key-poses": "inverse kinematics to the hands' key poses, each seen from where "
     "demonstrations differ least, along minimum-jerk paths with the mean timing",
     "key-poses-posture": "the same with the mean demonstrated posture in the null space",
-    "dmp": "dynamical movement primitives of the joints, one for each move, whose goals are "
-    "the key poses by inverse kinematics",
-    "promp": "a probabilistic movement primitive of the joints, conditioned on the present "
-    "posture and on the key poses by inverse kinematics",
     "act": "LeRobot's Action Chunking Transformer on joints and object poses",
     "act-phase": PHASE,
     "act-large": "it again, with LeRobot's own sizes: forty million weights",
     "act-large-phase": PHASE,
     "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
     "diffusion-phase": PHASE,
-    "mlp": "a perceptron on joints and object poses, which predicts the next actions",
-    "mlp-phase": PHASE,
-    "knn": "nearest-neighbour regression on joints and object poses to the next actions",
-    "knn-phase": PHASE,
     "nearest": "replays the demonstration whose objects stood nearest: the naive floor",
     "mean": "replays the mean of the aligned demonstrations, wherever the objects are",
 }

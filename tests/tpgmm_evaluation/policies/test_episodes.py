@@ -99,6 +99,6 @@ def test_the_common_clock_removes_differences_in_time():
     assert [float(rows[0, 0]) for _, rows, _ in training] == pytest.approx([1.0, 1.1, 0.9])
     state, action = training.columns[OBS_STATE], training.columns[ACTION]
     torch.testing.assert_close(action, state + 0.01, atol=1e-5, rtol=0)
-    assert training.elapsed()[: max(lengths)].tolist() == pytest.approx(
+    assert training.elapsed_time()[: max(lengths)].tolist() == pytest.approx(
         [i / FPS for i in range(max(lengths))]
     )
