@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +96,9 @@ def _extend_to_longest(demonstrations: Sequence[Demonstration]) -> list[Demonstr
         rows = torch.arange(len(longest)).clamp(max=len(shown) - 1)
         frames = {n: f[rows] if f.batch_shape else f for n, f in shown.frames.items()}
         extended.append(
-            replace(shown, time=longest.time, joints=shown.joints[rows], frames=frames)
+            Demonstration(
+                longest.time, shown.joints[rows], frames, shown.joint_names, shown.events
+            )
         )
     return extended
 
