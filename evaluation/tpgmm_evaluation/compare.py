@@ -205,7 +205,7 @@ def _tried(
                 names |= dict.fromkeys(every)
                 continue
             try:
-                task.disturbed(condition)
+                task.disturb(condition)
             except UnknownNameError as error:
                 unknown[task.env] = error
             else:

@@ -57,7 +57,7 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
     results = Results(folder / "cells")
     for cell in cells:
         runner = Runner.load(directory, cell.variant.arguments)
-        options = settings.disturbed(cell.condition)
+        options = settings.disturb(cell.condition)
         config = make_env_config(settings.benchmark().env, fps=training["fps"], **options)
         began, used = time.perf_counter(), time.process_time()
         rows = evaluate(runner, config, settings.seeds)
