@@ -74,7 +74,7 @@ class Recipe:
     falls: int = 2
 
     def describe(self) -> dict[str, Any]:
-        """For the record: everything as plain values."""
+        """Return everything as plain values, for the record."""
         return {**asdict(self), "config": self.config.__name__, "options": dict(self.options)}
 
 
@@ -193,7 +193,7 @@ def train(
     result = Training(policy, processors, recipe.rate, recipe.describe())
     deltas = config.observation_delta_indices, config.action_delta_indices
     windows, held_out = (
-        Windows(_normalized(episodes, preprocessor), episodes.bounds, stride, *deltas)
+        Windows(_normalize(episodes, preprocessor), episodes.bounds, stride, *deltas)
         for episodes in (training, validation)
     )
     rows = torch.linspace(0, len(held_out) - 1, CHECKED).long()
@@ -230,34 +230,43 @@ class _Learner:
         began = time.process_time()
         best, best_weights, waited, falls = math.inf, None, 0, 0
         while not self.result.outcome:
-            losses = [self._step() for _ in range(self.recipe.check_every)]
-            loss, error = self._validate()
-            point = {
-                "step": self.steps,
-                "seconds": time.process_time() - began,
-                "train_loss": sum(losses) / len(losses),
-                "validation_loss": loss,
-                "validation_error": error,
-            }
-            self.result.curve.append(point)
+            point = self._measure_block(began)
+            error, seconds = point["validation_error"], point["seconds"]
             report(" ".join(f"{key} {value:.5g}" for key, value in point.items()))
             waited = 0 if error < 0.99 * best else waited + 1
             if error < best:
                 best, best_weights = error, deepcopy(self.average.state_dict())
             # towards the end of the budget the rate falls by itself, for the last refinement
-            late = point["seconds"] > budget * (1 - 0.4 ** (falls + 1))
+            late = seconds > budget * (1 - 0.4 ** (falls + 1))
             if waited == self.recipe.patience or (late and falls < self.recipe.falls):
                 falls, waited = falls + 1, 0
-                for group in self.optimizer.param_groups:
-                    group["lr"] /= 3
+                self._lower_rate()
             if falls > self.recipe.falls:
                 self.result.outcome = "the validation error stopped falling"
-            elif point["seconds"] > budget:
+            elif seconds > budget:
                 self.result.outcome = f"the budget of {budget / 60:g} min was used up"
         if best_weights is None:
             raise DataError(f"training diverged: the validation error is {error}")
         self.policy.load_state_dict(best_weights)
         self.policy.eval()
+
+    def _measure_block(self, began: float) -> dict[str, float]:
+        """Train until the next validation; add its point to the curve."""
+        losses = [self._step() for _ in range(self.recipe.check_every)]
+        loss, error = self._validate()
+        point = {
+            "step": self.steps,
+            "seconds": time.process_time() - began,
+            "train_loss": sum(losses) / len(losses),
+            "validation_loss": loss,
+            "validation_error": error,
+        }
+        self.result.curve.append(point)
+        return point
+
+    def _lower_rate(self) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] /= 3
 
     def _step(self) -> float:
         batch = self.windows.at(torch.randint(len(self.windows), (self.recipe.batch_size,)))
@@ -279,7 +288,7 @@ class _Learner:
 
     @torch.no_grad()
     def _validate(self) -> tuple[float, float]:
-        """Loss and error of the average weights, with the same noise every time."""
+        """Compute loss and error of the average weights, with the same noise every time."""
         policy, config, batch = self.average, self.policy.config, self.held_out
         with torch.random.fork_rng():
             torch.manual_seed(0)
@@ -294,8 +303,8 @@ class _Learner:
         return float(loss), float(errors[valid].mean())
 
 
-def _normalized(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:
-    """All rows through the preprocessor at once."""
+def _normalize(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:
+    """Pass all rows through the preprocessor at once."""
     rows = preprocessor(episodes.columns)
     return {name: rows[name] for name in episodes.columns}
 
@@ -312,7 +321,7 @@ def _configure(recipe: Recipe, training: Episodes) -> PreTrainedConfig:
 
 
 def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
-    """Statistics with room at both ends, and no division by the spread of a constant."""
+    """Compute statistics with room at both ends, and without the spread of constants."""
     statistics = {}
     for key, values in training.columns.items():
         std, low, high = values.std(0), values.min(0).values, values.max(0).values
@@ -328,7 +337,7 @@ def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
 
 
 def _action_scale(postprocessor: Any, config: PreTrainedConfig) -> Tensor:
-    """Size of a unit of the normalised action [rad]."""
+    """Compute the size of a unit of the normalised action [rad]."""
     zero = torch.zeros(1, *config.output_features[ACTION].shape)
     scale: Tensor = (postprocessor(zero + 1) - postprocessor(zero))[0]
     return scale

@@ -107,6 +107,15 @@ class Results:
             raise DataError(f"{path} holds another cell, {content['cell']}")
         return content
 
+    def has(self, cell: Cell, say: Callable[[str], None]) -> bool:
+        """Return whether a cell is finished; ``say`` is told of a damaged file, which goes."""
+        try:
+            return self.read(cell) is not None
+        except DataError as error:
+            say(f"{error}; the cell is run again")
+            self.path(cell).unlink()
+            return False
+
     def read_all(self, say: Callable[[str], None]) -> list[dict[str, Any]]:
         """Read all results in the folder, in the order of their names.
 

@@ -79,7 +79,7 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Properties of the machine that results may depend on, without its name."""
+    """Describe what results may depend on of the machine, without its name."""
     return {
         "architecture": platform.machine(),
         "system": platform.system(),

@@ -59,7 +59,7 @@ class Runner:
 
     @torch.inference_mode()
     def act(self, observation: dict[str, Any]) -> Any:
-        """The action for what LeRobot's ``preprocess_observation`` makes of an observation."""
+        """Return the action for an observation that LeRobot preprocessed."""
         return self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
 
 
@@ -86,7 +86,7 @@ class _Outcomes:
 
 
 def _figures(info: Mapping[str, Any], index: int) -> dict[str, float]:
-    """The scalar figures of one environment, which gymnasium collected in arrays."""
+    """Return the scalar figures of one environment, which gymnasium collects in arrays."""
     return {
         key: float(values[index])
         for key, values in info.items()
@@ -99,7 +99,7 @@ def _figures(info: Mapping[str, Any], index: int) -> dict[str, float]:
 
 
 def _environments(config: EnvConfig, n: int) -> contextlib.closing[gym.vector.VectorEnv]:
-    """``n`` environments of one task, as LeRobot makes them."""
+    """Make ``n`` environments of one task, as LeRobot does."""
     [tasks] = make_env(config, n_envs=n).values()
     [vector] = tasks.values()
     return contextlib.closing(vector)
@@ -146,7 +146,7 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
 
 
 def latency(runner: Runner, config: EnvConfig) -> dict[str, float]:
-    """How long an action takes for one robot, from the raw observation on.
+    """Measure how long an action takes for one robot, from the raw observation on.
 
     Returns
     -------

@@ -89,6 +89,14 @@ class Settings:
             options = {**options, "condition": "+".join(others)}
         return options
 
+    def knows(self, condition: str) -> bool:
+        """Return whether the environment has a condition."""
+        try:
+            self.disturb(condition)
+        except UnknownNameError:
+            return False
+        return True
+
     def keep(self, path: Path) -> None:
         """Write to a file, or check that it says the same.
 

@@ -66,7 +66,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     )
     recipe = {
         "n_components": model.n_components,
-        "operators": [format_operator(one) for one in model.operators_],
+        "operators": list(map(format_operator, model.operators_)),
     }
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"
@@ -74,13 +74,14 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
 
 
 def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
-    """Operators of TP-GMM when one of its parts is removed.
+    """Choose the operators of TP-GMM when one of its parts is removed.
 
     Parameters
     ----------
     base : str
         ``"tpgmm"`` or an ablation.
     benchmark : Benchmark
+        The environment with its robot.
     """
     operators = benchmark.operators(
         orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
@@ -91,18 +92,18 @@ def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
     robot = benchmark.robot
     moved = robot.state(robot.lower.clamp(-1, 1)).jacobians.abs().sum((0, 1)) > 0
     free = [name for name, moves in zip(robot.joint_names, moved, strict=True) if not moves]
-    rest: list[Operator] = [one for one in operators if not isinstance(one, Canonical)]
+    rest: list[Operator] = [part for part in operators if not isinstance(part, Canonical)]
     return [*rest, Canonical(joints=tuple(free))] if free else rest
 
 
 def _environment_names(path: Path) -> list[str]:
-    """Which entry of the observation is what: operators may name objects in another order."""
+    """Name the entries of the observation: operators may have objects in another order."""
     columns = {column.key: column.names for column in describe_lerobot(path).columns}
     return list(columns[OBS_ENV_STATE] or ())
 
 
 def _at_first(demonstration: Demonstration) -> Demonstration:
-    """With all objects where they were at the beginning."""
+    """Put all objects where they were at the beginning."""
     frames = {
         name: frame[0] if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
@@ -126,7 +127,7 @@ def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
     return Training(policy, processors, kept.fps, outcome="kept as they are")
 
 
-def _situated(
+def _fit_plan(
     episodes: Path, settings: Settings, cell: Cell, kind: type[SituatedPolicy], **options: Any
 ) -> Training:
     """Fit what plans in joints to the aligned references."""
@@ -144,9 +145,9 @@ def _situated(
 TRAININGS: dict[str, Callable[[Path, Settings, Cell], Training]] = {
     "tpgmm": _tpgmm,
     **dict.fromkeys(ABLATIONS, _tpgmm),
-    "key-poses": partial(_situated, kind=KeyPosesPolicy),
-    "key-poses-posture": partial(_situated, kind=KeyPosesPolicy, posture=True),
+    "key-poses": partial(_fit_plan, kind=KeyPosesPolicy),
+    "key-poses-posture": partial(_fit_plan, kind=KeyPosesPolicy, posture=True),
     **dict.fromkeys(RECIPES, _baseline),
     "nearest": _nearest,
-    "mean": partial(_situated, kind=MeanPolicy),
+    "mean": partial(_fit_plan, kind=MeanPolicy),
 }
