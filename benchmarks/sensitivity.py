@@ -96,7 +96,7 @@ def _recorded(plan: Plan, name: str, folder: str) -> Iterator[Fold]:
     """Real recordings, four of them left out, one at a time."""
     if not (plan.data / folder).is_dir():
         return
-    example = plan.loaded("examples.leave_one_out")
+    example = plan.load_module("examples.leave_one_out")
     recording = example.RECORDINGS[name](plan.data / folder)
     shown, operators = recording.demonstrations, next(iter(recording.models.values()))
     for index in np.linspace(0, len(shown) - 1, 4).astype(int):
