@@ -42,7 +42,7 @@ def measure_planted(plan: Plan) -> Measured:
 
 
 def measure_bottle(plan: Plan) -> Measured:
-    """Measure the paper's skill as ``make demo`` learns it; if small, with a tenth of its instants."""
+    """Measure the paper's skill as ``make demo`` learns it, or at a tenth of its rate."""
     skill = BottleShaking(rate=10 if plan.small else 100)
     shown = skill.demonstrations(10, 0)
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(shown)
