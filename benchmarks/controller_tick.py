@@ -17,7 +17,7 @@ import torch
 
 from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned, skill
+from benchmarks.skill import fit_model, skill
 from benchmarks.timing import in_turns, medians, seconds
 from tpgmm_control import Controller
 from tpgmm_torch import Situation
@@ -41,8 +41,8 @@ Step = Callable[[float], Any]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Ticks of the skill from its start to its end in turns, and whole skills."""
-    model, ticks = learned(settings), settings.size(5_000, 30)
+    """Measure ticks of the skill from start to end in turns, and whole skills."""
+    model, ticks = fit_model(settings), settings.size(5_000, 30)
     [situation] = skill(settings).situations(1, settings.seed + 1000)
     start, frames = situation.joints, situation.frames
     dt, length = float(model.time_.diff().median()), len(model.time_)
@@ -56,7 +56,7 @@ def measure(settings: Settings) -> Iterator[Row]:
 
         return step
 
-    def controlled(options: Mapping[str, Any]) -> Step:
+    def begin_controller(options: Mapping[str, Any]) -> Step:
         made = Controller(model.skill, start, frames, **options)
         made.step(dt)
         given = {} if options else {"joints": start}
@@ -71,7 +71,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     ways: dict[str, Callable[[], Step]] = {PLAIN: plain}
     asked: dict[str, Asked | None] = {PLAIN: None}
     for name, (options, most) in CONTROLLERS.items():
-        ways[name] = partial(controlled, options)
+        ways[name] = partial(begin_controller, options)
         asked[name] = most if settings.full else None
     if settings.full:  # at tiny sizes, minutes of compiling show nothing
         path = settings.out / "estimate.pt2"
@@ -83,7 +83,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     for name, each in taken.items():
         middle, worst = np.percentile(each, [50, 99]).tolist()
         beside = ("", None) if name == PLAIN else (PLAIN, base)
-        work, limit = f"tick, {WORK}, {name}", settings.asked("most", 1.0)
+        work, limit = f"tick, {WORK}, {name}", settings.target("most", 1.0)
         yield Row(f"{work}: median", "ms", middle, *beside, asked=asked[name], rounds=ticks)
         yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
 
@@ -109,7 +109,7 @@ def measure(settings: Settings) -> Iterator[Row]:
 def _latencies(
     ways: Mapping[str, Callable[[], Step]], dt: float, ticks: int, length: int
 ) -> dict[str, np.ndarray]:
-    """Milliseconds of each tick; every way takes one before any takes the next."""
+    """Take milliseconds of each tick; every way takes one before any takes the next."""
     taken = {name: np.empty(ticks) for name in ways}
     steps = {name: begin() for name, begin in ways.items()}
     with torch.inference_mode():
@@ -126,7 +126,7 @@ def _latencies(
 def _in_cpp(
     package: Path, situation: Situation, dt: float, ticks: int, settings: Settings
 ) -> Iterator[Row]:
-    """What the example in C++ says of itself, where it can be built."""
+    """Measure the example in C++, where it can be built."""
     folder = settings.out / "deployment_cpp"
     if not (shutil.which("cmake") and shutil.which("g++")):
         return
@@ -150,6 +150,6 @@ def _in_cpp(
     )
     assert found is not None, done.stderr
     work, (middle, worst) = f"tick, {WORK}, exported estimate, C++", map(float, found.groups())
-    yield Row(f"{work}: median", "ms", middle, asked=settings.asked("most", 0.1), rounds=ticks)
-    limit = settings.asked("most", 1.0)
+    yield Row(f"{work}: median", "ms", middle, asked=settings.target("most", 0.1), rounds=ticks)
+    limit = settings.target("most", 1.0)
     yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
