@@ -241,10 +241,7 @@ class _Learner:
             if waited == self.recipe.patience or (late and falls < self.recipe.falls):
                 falls, waited = falls + 1, 0
                 self._lower_rate()
-            if falls > self.recipe.falls:
-                self.result.outcome = "the validation error stopped falling"
-            elif seconds > budget:
-                self.result.outcome = f"the budget of {budget / 60:g} min was used up"
+            self.result.outcome = self._outcome(falls, seconds, budget)
         if best_weights is None:
             raise DataError(f"training diverged: the validation error is {error}")
         self.policy.load_state_dict(best_weights)
@@ -263,6 +260,12 @@ class _Learner:
         }
         self.result.curve.append(point)
         return point
+
+    def _outcome(self, falls: int, seconds: float, budget: float) -> str:
+        """Return why training ends; nothing while it goes on."""
+        if falls > self.recipe.falls:
+            return "the validation error stopped falling"
+        return f"the budget of {budget / 60:g} min was used up" if seconds > budget else ""
 
     def _lower_rate(self) -> None:
         for group in self.optimizer.param_groups:

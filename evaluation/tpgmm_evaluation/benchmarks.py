@@ -185,7 +185,7 @@ class _HandlingBenchmark(Benchmark):
                     f"{n} are asked for"
                 )
             for number, motion in zip(chosen, self.motions(chosen, seed), strict=True):
-                measured, success = self._follow(env, number, motion)
+                measured, success = self.follow(env, number, motion)
                 tried.append(success)
                 if success:
                     kept.append((measured, _references(motion)))
@@ -208,7 +208,7 @@ class _HandlingBenchmark(Benchmark):
             start[name] = torch.cat((pose.position, pose.orientation)).numpy()
         return start
 
-    def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
+    def follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
         """Let the environment follow a motion; return what it measures, and its success."""
         observation, info = env.reset(seed=seed, options=self._start(motion))
         measured, seen, done = [], [], False

@@ -93,8 +93,7 @@ def compare(
     known = choose_conditions(tasks, conditions, say)
     for task in tasks:
         task.keep(out / task.env / "settings.json")
-    pending: list[list[Cell]] = []
-    total = 0
+    pending, total = [], 0
     for task, names in zip(tasks, known, strict=True):
         cells = dict.fromkeys(
             Cell(task.env, policy, n, seed, name)
@@ -105,18 +104,30 @@ def compare(
     say(f"{total} cells, {total - sum(map(len, pending))} of them finished before")
     groups = []
     for task, left in zip(tasks, pending, strict=True):
-        for seed in sorted({cell.seed for cell in left}):
-            say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
-            record(out / task.env, task, max(demonstrations), seed)
-        left.sort(key=lambda cell: cell.training)  # stable
-        groups += [
-            (out / task.env, task, list(same))
-            for _, same in groupby(left, key=lambda cell: cell.training)
-        ]
+        _record(out / task.env, task, left, max(demonstrations), say)
+        groups += _by_training(out / task.env, task, left)
     failures = _run(groups, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
     return Comparison(total - len(failures), failures)
+
+
+def _record(
+    folder: Path, task: Settings, cells: Sequence[Cell], n: int, say: Callable[[str], None]
+) -> None:
+    """Record the episodes that the trainings of cells learn from."""
+    for seed in sorted({cell.seed for cell in cells}):
+        say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
+        record(folder, task, n, seed)
+
+
+def _by_training(
+    folder: Path, task: Settings, cells: Sequence[Cell]
+) -> list[tuple[Path, Settings, list[Cell]]]:
+    """Group cells by their training, whose cells run one after the other."""
+    ordered = sorted(cells, key=lambda cell: cell.training)  # stable
+    groups = groupby(ordered, key=lambda cell: cell.training)
+    return [(folder, task, list(same)) for _, same in groups]
 
 
 def _check(
@@ -158,22 +169,29 @@ def choose_conditions(
         If none of them knows one.
     """
     every = [task.benchmark().all_conditions for task in tasks]  # an unknown task ends here
-    chosen: list[list[str]] = [[] for _ in tasks]
-    for condition in dict.fromkeys(conditions):
-        if condition == ALL_CONDITIONS:
-            chosen = [[*names, *more] for names, more in zip(chosen, every, strict=True)]
-            continue
-        knowing = [task.knows(condition) for task in tasks]
-        if not any(knowing):
-            tasks[0].disturb(condition)  # says what it knows
-        if not all(knowing):
-            unknown = [t.env for t, knows in zip(tasks, knowing, strict=True) if not knows]
-            say(f"{', '.join(unknown)}: not tried in {condition!r}, which is unknown there")
-        chosen = [
-            [*names, condition] if knows else names
-            for names, knows in zip(chosen, knowing, strict=True)
-        ]
-    return [list(dict.fromkeys(names)) for names in chosen]
+    for name in dict.fromkeys(conditions):
+        unknown = [t.env for t in tasks if name != ALL_CONDITIONS and not t.knows(name)]
+        if len(unknown) == len(tasks):
+            tasks[0].disturb(name)  # says what it knows
+        if unknown:
+            say(f"{', '.join(unknown)}: not tried in {name!r}, which is unknown there")
+    return [
+        _expand_conditions(task, conditions, names)
+        for task, names in zip(tasks, every, strict=True)
+    ]
+
+
+def _expand_conditions(
+    task: Settings, conditions: Sequence[str], every: Sequence[str]
+) -> list[str]:
+    """List the conditions that an environment knows, each once."""
+    chosen: list[str] = []
+    for name in conditions:
+        if name == ALL_CONDITIONS:
+            chosen += every
+        elif task.knows(name):
+            chosen.append(name)
+    return list(dict.fromkeys(chosen))
 
 
 def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:

@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
-from tpgmm_evaluation.cells import Results
+from tpgmm_evaluation.cells import Cell, Results
 from tpgmm_evaluation.compare import compare
 from tpgmm_evaluation.regressions.goldens import GOLDENS
 from tpgmm_evaluation.regressions.plan import Measured, Plan, import_paths
@@ -98,14 +98,20 @@ def demo(plan: Plan) -> Iterator[tuple[str, Work]]:
     yield "figures", work
 
 
+def _grid(disturbed: bool, small: bool) -> tuple[Sequence[str], Sequence[int], Sequence[int]]:
+    """Return the conditions, numbers of demonstrations and seeds of rollouts."""
+    if disturbed:
+        return FEW if small else ("all",), (10,), (0,)
+    return (NOMINAL,), (3, 10), (0,) if small else (0, 1, 2)
+
+
 def rollouts(
     tasks: Sequence[str], policies: Sequence[str], disturbed: bool, plan: Plan
 ) -> Iterator[tuple[str, Work]]:
     """Roll out cells of ``tpgmm compare``, which resumes by itself."""
-    conditions = (FEW if plan.small else ("all",)) if disturbed else (NOMINAL,)
-    counts, seeds = ((10,), (0,)) if disturbed else ((3, 10), (0, 1, 2))
     if plan.small:
-        policies, seeds = policies[:1], seeds[:1]
+        policies = policies[:1]
+    conditions, counts, seeds = _grid(disturbed, plan.small)
     settings = [Settings(task, episodes=6 if plan.small else 34) for task in tasks]
     out = plan.out / "rollouts"
     done = compare(settings, out, policies, counts, seeds, conditions, plan.workers)
@@ -113,10 +119,10 @@ def rollouts(
         raise TPGMMError(f"{len(done.failures)} cells failed: see {out}/TASK/failures")
     for task in settings:
         for result in Results(out / task.env / "cells").read_all(print):
-            cell = result["cell"]
-            if cell["policy"] in policies and disturbed == (cell["condition"] != NOMINAL):
-                group = f"{cell['policy']}-n{cell['demonstrations']}"
-                name = f"{cell['env']}-s{cell['seed']}-{cell['condition']}"
+            cell = Cell(**result["cell"])
+            if cell.policy in policies and disturbed == (cell.condition != NOMINAL):
+                name = f"{cell.env}-s{cell.seed}-{cell.condition}"
+                group = f"{cell.policy}-n{cell.demonstrations}"
                 yield f"{group}/{name}", partial(episode_figures, task, result)
 
 
