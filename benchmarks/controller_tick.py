@@ -95,7 +95,7 @@ def measure(settings: Settings) -> Iterator[Row]:
             "ms",
             middle,
             *beside,
-            asked=asked[name] if settings.full else None,
+            asked=asked[name],
             rounds=ticks,
         )
         yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)

@@ -50,14 +50,14 @@ def motions():
 
 
 @pytest.fixture(scope="module")
-def recorded(folder, settings):
+def recording(folder, settings):
     return load_lerobot(
         folder / "episodes" / "s0" / "training", robot=settings.benchmark().robot
     )
 
 
-def test_episodes_hold_what_was_seen_of_the_objects(recorded, motions):
-    for seen, motion in zip(recorded, motions, strict=False):
+def test_episodes_hold_what_was_seen_of_the_objects(recording, motions):
+    for seen, motion in zip(recording, motions, strict=False):
         bottle, tray = seen.frame("bottle"), seen.frame("tray")
         wanted = motion.frame("bottle")
         for key in ("position", "orientation"):

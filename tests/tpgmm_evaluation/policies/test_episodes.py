@@ -13,7 +13,7 @@ from tpgmm_torch.exceptions import DataError
 FPS = 20
 
 
-def numbered(*lengths):
+def number_rows(*lengths):
     """Episodes whose values tell where they come from: 100 times the episode, plus the row."""
     parts = []
     for number, length in enumerate(lengths):
@@ -22,7 +22,7 @@ def numbered(*lengths):
     return Episodes.join(FPS, parts)
 
 
-def windowed(episodes, *arguments):
+def cut_windows(episodes, *arguments):
     return Windows(episodes.columns, episodes.bounds, *arguments)
 
 
@@ -52,7 +52,7 @@ def test_episodes_are_read_as_they_were_written(tmp_path):
 
 
 def test_windows_stay_in_their_episode_at_the_lower_rate():
-    windows = windowed(numbered(8, 6), 2, [-1, 0], [0, 1, 2])
+    windows = cut_windows(number_rows(8, 6), 2, [-1, 0], [0, 1, 2])
     assert len(windows) == 14
     batch = windows.at(torch.tensor([0, 5, 8, 11]))
     # two steps, of two rows each, are seen
@@ -75,7 +75,7 @@ def test_windows_stay_in_their_episode_at_the_lower_rate():
 
 
 def test_without_a_history_observations_have_no_time_axis():
-    batch = windowed(numbered(8), 4, None, [0]).at(torch.tensor([3]))
+    batch = cut_windows(number_rows(8), 4, None, [0]).at(torch.tensor([3]))
     assert batch[OBS_STATE].shape == (1, 1)
     assert batch[ACTION].tolist() == [[[6.5]]]
 
