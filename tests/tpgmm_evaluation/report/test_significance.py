@@ -42,8 +42,6 @@ def test_mcnemar_is_twice_the_smaller_tail(one, other):
     assert mcnemar(one, other) == pytest.approx(min(1.0, tail))
     assert mcnemar(one, other) == mcnemar(other, one)
 
-
-def test_mcnemar_refuses_what_are_no_counts():
     with pytest.raises(DataError, match="-1 and 2 are no numbers"):
         mcnemar(-1, 2)
 
@@ -139,8 +137,7 @@ def test_tasks_count_alike_however_many_pairs_they_have():
     # of 0.25, 0.375, 0.5 and 0.75 the first is negative: 2 of 16 signs are no less one-sided
     assert row.p == pytest.approx(2 * 2 / 16)
 
-
-def test_policies_that_are_level_in_all_tasks_are_not_told_apart():
+    # level in all tasks
     results = [result(policy, 5, 9, env=env) for env in "ab" for policy in ("tpgmm", "act")]
     [row] = compare_over_tasks(episode_table(results)).itertuples()
     assert (row.difference, row.low, row.high, row.p) == (0, 0, 0, 1)
