@@ -21,7 +21,7 @@ ENVIRONMENT = {
 
 
 def settings() -> tuple[list[str], Settings]:
-    """Names of the cases, and how to measure them, from the command line."""
+    """Read the names of cases, and how to measure them, from the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--only", help=f"cases, with commas between: {','.join(CASES)}")
     parser.add_argument("--sizes", choices=("full", "tiny"), default="full")

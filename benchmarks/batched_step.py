@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned, skill
+from benchmarks.skill import fit_model, skill
 from benchmarks.timing import Work, in_turns, medians, per_call
 from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.skills.compiled import compile_skill
@@ -16,10 +16,10 @@ __all__ = ["measure", "tick"]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Every robot has its own bottle and posture; with one clock for all, or one each."""
+    """Measure robots with bottles and postures of their own, and one clock or many."""
     n_robots = settings.size(4096, 8)
     rounds = settings.rounds(9)
-    model = learned(settings, dtype="float32")
+    model = fit_model(settings, dtype="float32")
     clocks = {"one clock": False, "own clocks": True}
     measurements = {
         name: per_call(tick(model, settings, n_robots, own), 1) for name, own in clocks.items()
@@ -32,7 +32,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     taken = medians(in_turns(measurements, rounds, warm_up=True))
     for name in measurements:
         work = f"model.step, {n_robots} robots, {name}, float32, mean and covariance: per robot"
-        asked = settings.asked("most", 14 if "compiled" in name else 25)
+        asked = settings.target("most", 14 if "compiled" in name else 25)
         yield Row(work, "us", 1e6 * taken[name] / n_robots, asked=asked, rounds=rounds)
 
 
@@ -43,7 +43,7 @@ def tick(
     own_clocks: bool = True,
     estimate: Callable[..., Any] | None = None,
 ) -> Work:
-    """A tick of so many robots, 3 s after they began, or each a second sooner or later.
+    """Make a tick of so many robots, 3 s after they began, or a second sooner or later.
 
     They have caught up with the skill by some ticks, as robots on their way have.
     """

@@ -13,11 +13,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def ask(module: str, *arguments: object, launcher: tuple[str, ...] = ()) -> Any:
-    """Run a module of this folder as a program; what it gave to :func:`answer`.
+    """Run a module of this folder as a program; return what it gave to :func:`answer`.
 
     Parameters
     ----------
     module : str
+        Its name, without the package.
     *arguments
         Of its command line.
     launcher : sequence of str
@@ -59,7 +60,7 @@ def reset_peak() -> None:
 
 
 def peak_memory() -> float:
-    """Most memory that this process has held since :func:`reset_peak` [bytes] (Linux)."""
+    """Read the most memory that this process held since :func:`reset_peak` [bytes] (Linux)."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     [line] = [line for line in status.splitlines() if line.startswith("VmHWM:")]
     return 1024.0 * int(line.split()[1])

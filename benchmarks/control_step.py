@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned, skill
+from benchmarks.skill import fit_model, skill
 from tpgmm_torch.skills.compiled import compile_skill
 
 __all__ = ["measure"]
@@ -19,9 +19,9 @@ Step = Callable[..., Any]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Ten thousand ticks: the skill from start to end, and again from another start."""
+    """Measure ten thousand ticks: the skill from start to end, from many starts."""
     ticks = settings.size(10_000, 30)
-    model = learned(settings)
+    model = fit_model(settings)
     step: Step = model.step
     work = "model.step, batch 1, 17 joints, two hands, K = 10, P = 2, float64"
     for how, asked in (("eager", (0.45, 1.0)), ("compiled", (0.18, None))):
@@ -33,12 +33,12 @@ def measure(settings: Settings) -> Iterator[Row]:
         figures = float(np.median(taken)), float(np.percentile(taken, 99))
         names = "median", "99th percentile"
         for name, figure, most in zip(names, figures, asked, strict=True):
-            limit = None if most is None else settings.asked("most", most)
+            limit = None if most is None else settings.target("most", most)
             yield Row(f"{work}, {how}: {name}", "ms", figure, asked=limit, rounds=ticks)
 
 
 def _latencies(step: Step, time: Tensor, settings: Settings, ticks: int) -> np.ndarray:
-    """Seconds of each tick, of what a controller has to wait for: floats in, floats out."""
+    """Take seconds of each tick, of what a controller waits for: floats in, floats out."""
     grid = list(time)
     situations = skill(settings).situations(ticks // len(grid) + 1, settings.seed + 1000)
     taken = np.empty(ticks)

@@ -17,10 +17,10 @@ import torch
 
 from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned, skill
+from benchmarks.skill import fit_model, skill
 from benchmarks.timing import in_turns, medians, seconds
 from tpgmm_control import Controller
-from tpgmm_torch import Situation
+from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.skills.compiled import export_estimate
 
 __all__ = ["measure"]
@@ -40,38 +40,44 @@ CONTROLLERS: Mapping[str, tuple[Mapping[str, Any], Asked | None]] = {
 Step = Callable[[float], Any]
 
 
+def begin_plain(model: TaskParameterizedGMM, situation: Situation) -> Step:
+    """Begin a skill with the model's own step, on its clock."""
+    joints, grid = situation.joints, iter(model.time_.tolist())
+
+    def step(dt: float) -> None:
+        nonlocal joints
+        joints = model.step(next(grid), joints, situation.frames).joints
+
+    return step
+
+
+def begin_controller(
+    model: TaskParameterizedGMM, situation: Situation, dt: float, options: Mapping[str, Any]
+) -> Step:
+    """Begin a skill with a controller; without options it reads what it sent."""
+    made = Controller(model.skill, situation.joints, situation.frames, **options)
+    made.step(dt)
+    given = {} if options else {"joints": situation.joints}
+
+    def step(dt: float) -> None:
+        command = made.step(dt, **given)
+        if given:
+            given["joints"] = command.reference
+
+    return step
+
+
 def measure(settings: Settings) -> Iterator[Row]:
-    """Ticks of the skill from its start to its end in turns, and whole skills."""
-    model, ticks = learned(settings), settings.size(5_000, 30)
+    """Measure ticks of the skill from start to end in turns, and whole skills."""
+    model, ticks = fit_model(settings), settings.size(5_000, 30)
     [situation] = skill(settings).situations(1, settings.seed + 1000)
-    start, frames = situation.joints, situation.frames
     dt, length = float(model.time_.diff().median()), len(model.time_)
 
-    def plain() -> Step:
-        joints, grid = start, iter(model.time_.tolist())
-
-        def step(dt: float) -> None:
-            nonlocal joints
-            joints = model.step(next(grid), joints, frames).joints
-
-        return step
-
-    def controlled(options: Mapping[str, Any]) -> Step:
-        made = Controller(model.skill, start, frames, **options)
-        made.step(dt)
-        given = {} if options else {"joints": start}
-
-        def step(dt: float) -> None:
-            command = made.step(dt, **given)
-            if given:
-                given["joints"] = command.reference
-
-        return step
-
+    plain = partial(begin_plain, model, situation)
     ways: dict[str, Callable[[], Step]] = {PLAIN: plain}
     asked: dict[str, Asked | None] = {PLAIN: None}
     for name, (options, most) in CONTROLLERS.items():
-        ways[name] = partial(controlled, options)
+        ways[name] = partial(begin_controller, model, situation, dt, options)
         asked[name] = most if settings.full else None
     if settings.full:  # at tiny sizes, minutes of compiling show nothing
         path = settings.out / "estimate.pt2"
@@ -83,8 +89,15 @@ def measure(settings: Settings) -> Iterator[Row]:
     for name, each in taken.items():
         middle, worst = np.percentile(each, [50, 99]).tolist()
         beside = ("", None) if name == PLAIN else (PLAIN, base)
-        work, limit = f"tick, {WORK}, {name}", settings.asked("most", 1.0)
-        yield Row(f"{work}: median", "ms", middle, *beside, asked=asked[name], rounds=ticks)
+        work, limit = f"tick, {WORK}, {name}", settings.target("most", 1.0)
+        yield Row(
+            f"{work}: median",
+            "ms",
+            middle,
+            *beside,
+            asked=asked[name],
+            rounds=ticks,
+        )
         yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
 
     def whole(begin: Callable[[], Step]) -> float:
@@ -96,9 +109,10 @@ def measure(settings: Settings) -> Iterator[Row]:
         with torch.inference_mode():
             return seconds(run)
 
-    runs = {PLAIN: partial(whole, plain)}
-    predicted = partial(model.predict, [situation], candidates=False)
-    runs["predict"] = partial(seconds, predicted)
+    runs = {
+        PLAIN: partial(whole, plain),
+        "predict": partial(seconds, partial(model.predict, [situation], candidates=False)),
+    }
     found = medians(in_turns(runs, settings.rounds(5), warm_up=settings.full))
     # 0.65 s where a step takes 0.36 ms
     most = Asked("times", 0.65 / (1482 * 0.36e-3)) if settings.full else None
@@ -109,7 +123,7 @@ def measure(settings: Settings) -> Iterator[Row]:
 def _latencies(
     ways: Mapping[str, Callable[[], Step]], dt: float, ticks: int, length: int
 ) -> dict[str, np.ndarray]:
-    """Milliseconds of each tick; every way takes one before any takes the next."""
+    """Take milliseconds of each tick; every way takes one before any takes the next."""
     taken = {name: np.empty(ticks) for name in ways}
     steps = {name: begin() for name, begin in ways.items()}
     with torch.inference_mode():
@@ -126,7 +140,7 @@ def _latencies(
 def _in_cpp(
     package: Path, situation: Situation, dt: float, ticks: int, settings: Settings
 ) -> Iterator[Row]:
-    """What the example in C++ says of itself, where it can be built."""
+    """Measure the example in C++, where it can be built."""
     folder = settings.out / "deployment_cpp"
     if not (shutil.which("cmake") and shutil.which("g++")):
         return
@@ -150,6 +164,6 @@ def _in_cpp(
     )
     assert found is not None, done.stderr
     work, (middle, worst) = f"tick, {WORK}, exported estimate, C++", map(float, found.groups())
-    yield Row(f"{work}: median", "ms", middle, asked=settings.asked("most", 0.1), rounds=ticks)
-    limit = settings.asked("most", 1.0)
+    yield Row(f"{work}: median", "ms", middle, asked=settings.target("most", 0.1), rounds=ticks)
+    limit = settings.target("most", 1.0)
     yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)

@@ -10,7 +10,7 @@ from benchmarks.batched_step import tick
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned
+from benchmarks.skill import fit_model
 from benchmarks.timing import in_turns, medians, per_call, per_iteration
 
 __all__ = ["measure"]
@@ -31,7 +31,7 @@ class _Curve:
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Five curves, in ``cost.png``; every point is a row too."""
+    """Measure five curves, in ``cost.png``; every point is a row too."""
     rounds = settings.rounds(3)
     usual, components = settings.size(26_000, 650), settings.size(COMPONENTS, 3)
 
@@ -45,7 +45,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         return {name: 1e3 * s for name, s in medians(in_turns(measurements, rounds)).items()}
 
     def step(n_robots: int) -> Mapping[str, float]:
-        work = tick(learned(settings), settings, n_robots)
+        work = tick(fit_model(settings), settings, n_robots)
         measurements = {"ours": per_call(work, max(1, settings.size(64, 1) // n_robots))}
         [taken] = medians(in_turns(measurements, rounds, warm_up=True)).values()
         return {"ours": 1e6 * taken / n_robots}

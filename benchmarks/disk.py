@@ -29,13 +29,14 @@ class Batches:
     Parameters
     ----------
     folder : Path
+        With the files.
     """
 
     def __init__(self, folder: Path) -> None:
         self.paths = sorted(folder.glob("*.parquet"))
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
-        """One pass."""
+        """Iterate over one pass."""
         for batch in self.records():
             # a column is contiguous on disk, and stays so
             columns = np.empty((batch.num_columns, batch.num_rows), dtype=np.float32)
@@ -44,7 +45,7 @@ class Batches:
             yield columns.T
 
     def records(self) -> Iterator[object]:
-        """One pass as pyarrow has them, in one thread."""
+        """Iterate over one pass as pyarrow has it, in one thread."""
         from pyarrow import parquet
 
         for path in self.paths:
@@ -52,7 +53,7 @@ class Batches:
 
 
 def measure(settings: Settings) -> Iterator[Row | Omitted]:
-    """One pass of EM over all files, and the peak memory of the whole process."""
+    """Measure a pass of EM over all files, and the peak memory of the whole process."""
     n_points, n_components = settings.size(10_000_000, 2_600), settings.size(10, 3)
     rounds = settings.rounds(1)
     work = f"EM on disk, N = {n_points} x {sum(BLOCKS)} float32, K = {n_components}"
@@ -64,18 +65,18 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
         shutil.rmtree(folder)
     note = "files in the system's cache, read once into another"
     beside = ("pyarrow reads the same columns", found["pyarrow"])
-    asked = settings.asked("times", 4)
+    asked = settings.target("times", 4)
     name = f"{work}: one pass"
     yield Row(name, "s", found["ours"], *beside, asked, rounds=rounds, note=note)
     if found["peak"] is None:
         yield Omitted(f"{work}: peak memory", "it cannot be read on this system")
     else:
-        asked = settings.asked("most", 1.2)
+        asked = settings.target("most", 1.2)
         yield Row(f"{work}: peak memory, imports included", "GB", found["peak"], asked=asked)
 
 
 def _write(folder: Path, n_rows: int, seed: int) -> None:
-    """The same points in every file: what they are does not matter here."""
+    """Write the same points to every file: what they are does not matter here."""
     import pyarrow
     from pyarrow import parquet
 

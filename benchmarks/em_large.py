@@ -25,7 +25,7 @@ NOTES = (
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """One iteration from a given start, for few and for many components."""
+    """Measure an iteration from a given start, for few and for many components."""
     n_points = settings.size(1_000_000, 1_300)
     points = motions(n_points, seed=settings.seed)
     for n_components, asked in ASKED.items():
@@ -36,7 +36,7 @@ def measure(settings: Settings) -> Iterator[Row]:
 def _rows(settings: Settings, problem: Problem, asked: tuple[float, ...]) -> Iterator[Row]:
     n_points, n_components = len(problem.points), len(problem.weights)
     fits = {
-        "dense, float64": (mixtures.ours(problem.shuffled(settings.seed)), "float64"),
+        "dense, float64": (mixtures.ours(problem.shuffle_times(settings.seed)), "float64"),
         "gated, float64": (mixtures.ours(problem), "float64"),
         "gated, float32": (mixtures.ours(problem, "float32"), "float32"),
     }
@@ -55,7 +55,7 @@ def _rows(settings: Settings, problem: Problem, asked: tuple[float, ...]) -> Ite
         share = flops / taken[name] / peak(getattr(torch, dtype))
         work = f"EM iteration, N = {n_points}, K = {n_components}, {name}"
         other = f"scikit-learn, full, {dtype}, {len(every[dtype])} round(s)"
-        asked, n = settings.asked("faster", figure), len(every[name])
+        asked, n = settings.target("faster", figure), len(every[name])
         note = NOTES["gated" in name]
         yield Row(work, "s", taken[name], other, taken[dtype], asked, share, n, note)
     gc.collect()

@@ -18,7 +18,7 @@ OTHERS = {"pomegranate": mixtures.pomegranate, "gmr": mixtures.gmr}
 
 
 def measure(settings: Settings) -> Iterator[Row | Omitted]:
-    """One iteration from a given start, and one of each of ten starts."""
+    """Measure an iteration from a given start, and of each of ten starts."""
     n_points, n_components = settings.size(13_000, 650), settings.size(10, 3)
     problem = Problem.of(motions(n_points, seed=settings.seed), n_components)
     ours, starts = mixtures.ours(problem), mixtures.ours(problem, n_init=STARTS)
@@ -42,7 +42,7 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     theirs = ("scikit-learn, full", milli["scikit-learn"])
     for name, starts, figure in (("", 1, 4.5), (f", per start of {STARTS}", STARTS, 9)):
         each = (milli["restarts"] if name else milli["ours"]) / starts
-        asked, share = settings.asked("faster", figure), 1e3 * flops / each
+        asked, share = settings.target("faster", figure), 1e3 * flops / each
         yield Row(work + name, "ms", each, *theirs, asked, share, rounds)
     for name in OTHERS:
         if name in milli:

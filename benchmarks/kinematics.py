@@ -14,7 +14,7 @@ __all__ = ["measure"]
 
 
 def measure(settings: Settings) -> Iterator[Row | Omitted]:
-    """One posture of 17 joints, and a batch of them, in float64."""
+    """Measure a posture of 17 joints, and a batch of them, in float64."""
     robot = upper_body()
     try:
         theirs = _pinocchio()
@@ -45,7 +45,7 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
 
 
 def _pinocchio() -> Callable[[object], object]:
-    """The fastest way of pinocchio: all joint Jacobians at once, then those of the hands."""
+    """Make pinocchio's fastest way: all joint Jacobians at once, then the hands'."""
     import pinocchio
 
     model = pinocchio.buildModelFromXML(upper_body_urdf())

@@ -26,7 +26,7 @@ PACKAGES = (
 
 
 def machine() -> dict[str, Any]:
-    """Processor, memory, threads, versions, date, and how busy the machine is."""
+    """Describe processor, memory, threads, versions, date and load of the machine."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -44,7 +44,7 @@ def machine() -> dict[str, Any]:
 
 
 def cores_allowed() -> int:
-    """How many cores this process may use."""
+    """Count the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -13,7 +13,7 @@ from benchmarks.child import ask
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import aligned, learned, model, skill
+from benchmarks.skill import align_demonstrations, fit_model, model, skill
 from benchmarks.timing import (
     Measurement,
     Work,
@@ -35,8 +35,8 @@ FEW = 2
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Import, fit, EM, a step and whole skills; plain, and a compiled step."""
-    made, shown = learned(settings), aligned(settings)
+    """Measure import, fit, EM, a step and whole skills; plain, and a compiled step."""
+    made, shown = fit_model(settings), align_demonstrations(settings)
     given = skill(settings).situations(settings.size(50, 2), settings.seed + 1000)
     problem = Problem.of(motions(settings.size(13_000, 650), seed=settings.seed), 10)
     large = Problem.of(motions(settings.size(1_000_000, 1_300), seed=settings.seed), 10)
@@ -71,7 +71,7 @@ def _once(work: Work) -> Measurement:
 
 
 def _one_robot(settings: Settings, step: Callable[..., Any]) -> Work:
-    """A tick of one robot that has caught up with the skill, 3 s after it began."""
+    """Make a tick of a robot that has caught up with the skill, 3 s after it began."""
     [situation] = skill(settings).situations(1, settings.seed + 2000)
     time, joints = torch.tensor(3.0, dtype=torch.float64), situation.joints
     for _ in range(5):

@@ -16,7 +16,7 @@ LIBRARIES = {"ours": mixtures.ours, "scikit-learn": mixtures.scikit_learn}
 
 
 def measure(settings: Settings) -> Iterator[Row | Omitted]:
-    """Two iterations, each library in a process of its own."""
+    """Measure two iterations, each library in a process of its own."""
     n_points, n_components = settings.size(1_000_000, 1_300), settings.size(50, 5)
     work = f"EM, N = {n_points}, K = {n_components}, float64: memory above the points"
     try:
@@ -25,12 +25,12 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
         yield Omitted(work, f"the peak of the memory cannot be read on this system: {error}")
         return
     used = ask("memory", n_points, n_components, settings.seed)
-    asked = settings.asked("most", 0.3)
+    asked = settings.target("most", 0.3)
     yield Row(work, "GB", used["ours"], "scikit-learn, full", used["scikit-learn"], asked)
 
 
 def _above(library: str, n_points: int, n_components: int, seed: int) -> float:
-    """How much memory a fit takes beyond what is held before [GB]."""
+    """Measure the memory that a fit takes beyond what is held before [GB]."""
     few = Problem.of(motions(1_300, seed=seed), n_components)
     LIBRARIES[library](few)(1)  # what is loaded and kept once, whatever the points
     fit = LIBRARIES[library](Problem.of(motions(n_points, seed=seed), n_components))
@@ -41,7 +41,7 @@ def _above(library: str, n_points: int, n_components: int, seed: int) -> float:
 
 
 def _each(*sizes: int) -> dict[str, float]:
-    """Each library in a process that has done nothing but the imports."""
+    """Measure each library in a process that has done nothing but the imports."""
     forked = multiprocessing.get_context("fork")
     with forked.Pool(1, maxtasksperchild=1) as pool:
         return {name: pool.apply(_above, (name, *sizes)) for name in LIBRARIES}

@@ -21,7 +21,7 @@ Fit = Callable[[int], object]
 
 
 def ours(problem: Problem, dtype: str = "float64", n_init: int = 1) -> Fit:
-    """Our own: blocks as they are, from the start given, or from so many others."""
+    """Fit with this library: blocks as they are, from the start given or from others."""
     points = problem.points.astype(dtype, copy=False)
     start = problem.start if n_init == 1 else None
 
@@ -37,12 +37,12 @@ def ours(problem: Problem, dtype: str = "float64", n_init: int = 1) -> Fit:
 
 
 def scikit_learn(problem: Problem, dtype: str = "float64") -> Fit:
-    """scikit-learn, full covariance of all columns in one block.
+    """Fit with scikit-learn, full covariance of all columns in one block.
 
     The nearest of its covariance types: it has no blocks. Given precisions spare it k-means,
     rows are contiguous, and float32 points are computed with in float32.
     """
-    points, means, covariances = problem.joined(dtype)
+    points, means, covariances = problem.join_blocks(dtype)
     start = {
         "weights_init": problem.weights.astype(dtype),
         "means_init": means,
@@ -58,11 +58,11 @@ def scikit_learn(problem: Problem, dtype: str = "float64") -> Fit:
 
 
 def pomegranate(problem: Problem) -> Fit:
-    """The package pomegranate, full covariance: tensors, the start given, no early end."""
+    """Fit with pomegranate, full covariance: tensors, the start given, no early end."""
     from pomegranate.distributions import Normal
     from pomegranate.gmm import GeneralMixtureModel
 
-    points, means, covariances = map(torch.from_numpy, problem.joined())
+    points, means, covariances = map(torch.from_numpy, problem.join_blocks())
     weights = torch.from_numpy(problem.weights)
 
     def fit(n: int) -> object:
@@ -79,10 +79,10 @@ def pomegranate(problem: Problem) -> Fit:
 
 
 def gmr(problem: Problem) -> Fit:
-    """gmr, which has full covariances only; the start given, no early end (R_diff = 0)."""
+    """Fit with gmr, full covariances: the start given, no early end (R_diff = 0)."""
     from gmr import GMM
 
-    points, means, covariances = problem.joined()
+    points, means, covariances = problem.join_blocks()
 
     def fit(n: int) -> object:
         mixture = GMM(len(means), problem.weights.copy(), means.copy(), covariances.copy())

@@ -19,12 +19,12 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -48,14 +48,14 @@ THERE, LONGEST = 0.01, 16.0
 
 
 @cache
-def learned() -> tuple[Any, tuple[Demonstration, ...], float, float]:
-    """The skill, its demonstrations, when hands have closed, and when the bottle is there."""
+def learn_skill() -> tuple[Any, tuple[Demonstration, ...], float, float]:
+    """Learn the skill; return it, its demonstrations, and when hands close and arrive."""
     recorded = BottleShaking(rate=20).demonstrations(10, seed=0)
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(recorded)
     robot = BottleShaking().robot
     model = TaskParameterizedGMM(20, bottle_operators(), robot).fit(aligned)
     closed, brought = (
-        float(np.mean([one.events[name] for one in aligned])) for name in ("grasp", "shake")
+        float(np.mean([shown.events[name] for shown in aligned])) for name in ("grasp", "shake")
     )
     return model.skill, tuple(aligned), closed, brought
 
@@ -74,81 +74,90 @@ class Drawn:
 
     @property
     def held(self) -> bool:
-        """Whether the hands hold the bottle."""
+        """True if the hands hold the bottle."""
         return self.kind == "carried"
 
 
-def drawn(number: int) -> Drawn:
-    """A scene by its number: nothing is in the way at first, and something later."""
+def draw_scene(number: int) -> Drawn:
+    """Draw a scene by its number: nothing is in the way at first, and something later."""
     rng = np.random.default_rng((7, number))
     for _ in range(100):
-        one = _drawn(number, rng)
-        run = _run(
-            one.skill, one.joints, one.frames, None, 0.04, (one.begin, one.end), one.held
-        )
-        distances = _distances(one, run["references"]).values()
+        scene = _draw(KINDS[number % len(KINDS)], rng)
+        part = scene.begin, scene.end
+        run = _run(scene.skill, scene.joints, scene.frames, None, 0.04, part, scene.held)
+        distances = _distances(scene, run["references"]).values()
         if all(d[0] > 0 for d in distances) and any((d < 0).any() for d in distances):
-            return one
+            return scene
     raise RuntimeError(f"nothing is in the way in scene {number}")
 
 
-def _drawn(number: int, rng: np.random.Generator) -> Drawn:
-    kind = KINDS[number % len(KINDS)]
-    skill, demonstrations, closed, brought = learned()
+def _draw(kind: str, rng: np.random.Generator) -> Drawn:
+    skill, demonstrations, closed, brought = learn_skill()
     robot = skill.kinematics
     [situation] = BottleShaking().situations(1, seed=int(rng.integers(10**6)))
-    bottle = Shape.cylinder("bottle", RADIUS, 2 * HALF, [0, 0, 0], carrier="bottle")
-    carried = kind == "carried"
-    begin, joints, frames = None, situation.joints, situation.frames
-    free = _run(skill, joints, frames, None, 0.04, (0.0, brought))
+    free = _run(skill, situation.joints, situation.frames, None, 0.04, (0.0, brought))
+    references, states = free["references"], robot.state(free["references"])
     at = int(rng.uniform(0.3, 0.85) * closed / 0.04)
-    states = robot.state(free["references"])
     side = HANDS[int(rng.integers(2))]
-    place = states.position(side)[at].numpy()
+    if kind == "carried":
+        begin, (frames, solid) = int(closed / 0.04), _draw_on_the_way_of_the_bottle(rng, states)
+        bottle = Shape.cylinder("bottle", RADIUS, 2 * HALF, [0, 0, 0], carrier="bottle")
+        scene = Scene(robot, [solid, bottle], visuals=True, allowed=TOUCH)
+        scene = scene.allowing(demonstrations)
+        return Drawn(kind, skill, scene, brought, closed, references[begin], frames)
     solids: list[Shape] = []
-    if kind in ("ball", "box"):
-        if rng.random() < 0.4:
-            place = 0.5 * (place + _elbow(free["references"][at], side))
-        place = place + rng.normal(0, 0.01, 3)
-        size = rng.uniform(0.02, 0.04)
-        if kind == "ball":
-            solids.append(Shape.sphere("ball", size, place))
-        else:
-            turn = rng.standard_normal(4)
-            turn /= np.linalg.norm(turn)
-            edges = 2 * rng.uniform(0.02, 0.04, 3)
-            solids.append(Shape.box("box", edges, place, orientation=turn))
-    elif kind == "table":
-        # hands come down to the bottle from the side
-        x, y, z = place
-        edge = y + np.sign(y) * rng.uniform(-0.03, 0.03)
-        centre = [x, edge + np.sign(y) * 0.1, z - rng.uniform(-0.02, 0.02)]
-        solids.append(Shape.box("table", [0.25, 0.2, 0.02], centre))
-    elif kind == "arms":
+    if kind == "arms":
         other = HANDS[side == HANDS[0]]
         target = states.position(side)[at] + torch.from_numpy(rng.normal(0, 0.01, 3))
         target[1] *= 0.5
         skill = ViaPoints(skill, [ViaPoint(0.04 * at, f"position:{other}", target)])
     else:
-        begin = closed
-        start = int(closed / 0.04)
-        joints = free["references"][start]
-        middle = (0.5 * (states.position(HANDS[0]) + states.position(HANDS[1]))).numpy()
-        frames = {"bottle": Frame(middle[start])}
-        along = start + int(rng.uniform(0.4, 0.8) * (brought - closed) / 0.04)
-        way, size = middle[along] - middle[start], rng.uniform(0.015, 0.03)
-        ahead = way / np.linalg.norm(way) * (RADIUS + size - rng.uniform(0.01, 0.03))
-        solids.append(Shape.sphere("ball", size, middle[along] + ahead))
-    solids += [bottle] * carried
-    scene = Scene(robot, solids, visuals=True, allowed=TOUCH if carried else ())
-    return Drawn(
-        kind, skill, scene.allowing(demonstrations),
-        brought if carried else closed + 0.5, begin, joints, frames,
-    )  # fmt: skip
+        place = states.position(side)[at].numpy()
+        if kind == "table":
+            solids.append(_draw_table(rng, place))
+        else:
+            if rng.random() < 0.4:
+                place = 0.5 * (place + _elbow(references[at], side))
+            solids.append(_draw_solid(kind, rng, place + rng.normal(0, 0.01, 3)))
+    scene = Scene(robot, solids, visuals=True, allowed=()).allowing(demonstrations)
+    start = situation.joints, situation.frames
+    return Drawn(kind, skill, scene, closed + 0.5, None, *start)
+
+
+def _draw_solid(kind: str, rng: np.random.Generator, place: Any) -> Shape:
+    """Draw a ball or a box."""
+    size = rng.uniform(0.02, 0.04)
+    if kind == "ball":
+        return Shape.sphere("ball", size, place)
+    turn = rng.standard_normal(4)
+    turn /= np.linalg.norm(turn)
+    edges = 2 * rng.uniform(0.02, 0.04, 3)
+    return Shape.box("box", edges, place, orientation=turn)
+
+
+def _draw_table(rng: np.random.Generator, place: Any) -> Shape:
+    """Draw a table beside a hand, which comes down to the bottle from the side."""
+    x, y, z = place
+    edge = y + np.sign(y) * rng.uniform(-0.03, 0.03)
+    centre = [x, edge + np.sign(y) * 0.1, z - rng.uniform(-0.02, 0.02)]
+    return Shape.box("table", [0.25, 0.2, 0.02], centre)
+
+
+def _draw_on_the_way_of_the_bottle(
+    rng: np.random.Generator, states: Any
+) -> tuple[dict[str, Frame], Shape]:
+    """Draw a ball that the bottle would meet; return it with where the bottle is."""
+    *_, closed, brought = learn_skill()
+    start = int(closed / 0.04)
+    middle = (0.5 * (states.position(HANDS[0]) + states.position(HANDS[1]))).numpy()
+    along = start + int(rng.uniform(0.4, 0.8) * (brought - closed) / 0.04)
+    way, size = middle[along] - middle[start], rng.uniform(0.015, 0.03)
+    ahead = way / np.linalg.norm(way) * (RADIUS + size - rng.uniform(0.01, 0.03))
+    return {"bottle": Frame(middle[start])}, Shape.sphere("ball", size, middle[along] + ahead)
 
 
 def _elbow(joints: Tensor, hand: str) -> Any:
-    """Where the forearm of a hand begins."""
+    """Compute where the forearm of a hand begins."""
     robot = BottleShaking().robot
     config = {**robot.config(), "links": [f"{hand[0]}_forearm"]}
     return type(robot).from_config(config).state(joints).positions[0].numpy()
@@ -158,7 +167,7 @@ def _run(
     skill: Any, joints: Tensor, frames: Mapping[str, Frame], scene: Scene | None, dt: float,
     part: tuple[float | None, float], held: bool = False, stop: float | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """References of a controller, and what else is asked of them."""
+    """Run a controller; return its references, reasons and durations of ticks."""
     begin, end = part
     clock = "even" if stop is None else f"waiting:arrivals={stop}"
     running = Controller(
@@ -182,7 +191,7 @@ def _run(
 
 
 def _distances(one: Drawn, references: Tensor) -> dict[tuple[str, str], Any]:
-    """Distances of pairs in a motion, with what the hands hold."""
+    """Compute distances of pairs in a motion, with what the hands hold."""
     time = torch.arange(len(references), dtype=torch.float64)
     holds = [Hold("bottle", "l_hand", 0.0, len(references))] if one.held else []
     robot = one.skill.kinematics
@@ -191,16 +200,16 @@ def _distances(one: Drawn, references: Tensor) -> dict[tuple[str, str], Any]:
 
 
 def _deepest(distances: Mapping[tuple[str, str], Any]) -> tuple[float, str]:
-    """The least distance in a motion [m], and of which pair."""
+    """Find the least distance in a motion [m], and its pair."""
     every = ((float(d.min()), " / ".join(pair)) for pair, d in distances.items())
     return min(every, default=(np.inf, ""))
 
 
-def examined(number: int, dt: float) -> dict[str, Any]:
-    """Figures of one scene: without obstacles, and with them."""
+def examine_scene(number: int, dt: float) -> dict[str, Any]:
+    """Measure one scene: without obstacles, and with them."""
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
-    one = drawn(number)
+    one = draw_scene(number)
     given = one.skill, one.joints, one.frames
     part = one.begin, one.end
     bare = _run(*given, None, dt, part, one.held)
@@ -242,36 +251,40 @@ def _share(found: int, of: int) -> str:
     return f"{found} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def summary(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Some lines for each rate and kind, and all kinds."""
-    for dt, kind in product(sorted({row["dt"] for row in rows}), (*KINDS, "all")):
-        some = [r for r in rows if r["dt"] == dt and kind in (r["kind"], "all")]
-        if not some:
-            continue
-        possible = [r for r in some if r["possible"]]
-        there = [r for r in possible if r["finished"] and r["off_mm"] <= 1e3 * THERE]
-        held = [r for r in some if not r["finished"]]
-        calm = [r["trembles"] for r in held if r["trembles"] is not None] or [0.0]
-        of = {key: [r[key] for r in some] for key in ("bare_mm", "kept_mm", "bounds")}
-        ticks = [np.median([r[key] for r in some]) for key in ("bare_ms", "kept_ms")]
-        yield f"{1 / dt:.0f} Hz, {kind}, {len(some)} scenes"
-        yield (
-            f"  penetrate: {sum(x < 0 for x in of['bare_mm'])} without, "
-            f"{sum(x < 0 for x in of['kept_mm'])} with (least {min(of['kept_mm']):.1f} mm)"
-        )
-        yield f"  within 10 mm where possible: {_share(len(there), len(possible))}"
-        yield (
-            f"  held: {len(held)}, {sum(not r['reason'] for r in held)} without a reason; "
-            f"second differences there {np.median(calm):.4f}, at most {max(calm):.4f} rad"
-        )
-        yield (
-            f"  bounds used: {max(of['bounds']):.4f}; a tick {ticks[0]:.2f} ms without, "
-            f"{ticks[1]:.2f} with"
-        )
+def summarize(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Format some lines for each rate and kind, and all kinds."""
+    found = pd.DataFrame(rows)
+    for dt, group in found.groupby("dt"):
+        for kind in (*KINDS, "all"):
+            some = group if kind == "all" else group[group.kind == kind]
+            if not some.empty:
+                yield f"{1 / dt:.0f} Hz, {kind}, {len(some)} scenes"
+                yield from _lines(some)
+
+
+def _lines(scenes: pd.DataFrame) -> Iterator[str]:
+    possible = scenes[scenes.possible]
+    there = possible.finished & (possible.off_mm <= 1e3 * THERE)
+    held = scenes[~scenes.finished]
+    trembling = held.trembles.dropna().astype(float)
+    calm = trembling if len(trembling) else pd.Series([0.0])
+    yield (
+        f"  penetrate: {(scenes.bare_mm < 0).sum()} without, "
+        f"{(scenes.kept_mm < 0).sum()} with (least {scenes.kept_mm.min():.1f} mm)"
+    )
+    yield f"  within 10 mm where possible: {_share(int(there.sum()), len(possible))}"
+    yield (
+        f"  held: {len(held)}, {(held.reason == '').sum()} without a reason; "
+        f"second differences there {calm.median():.4f}, at most {calm.max():.4f} rad"
+    )
+    yield (
+        f"  bounds used: {scenes.bounds.max():.4f}; a tick {scenes.bare_ms.median():.2f} ms "
+        f"without, {scenes.kept_ms.median():.2f} with"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.obstacle_scenes")
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
@@ -282,12 +295,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     numbers, rows = range(given.first, given.first + given.scenes), []
     with get_context("forkserver").Pool(given.workers) as pool:
         for rate in map(float, given.rates.split(",")):
-            for row in pool.imap(partial(examined, dt=1 / rate), numbers):
+            for row in pool.imap(partial(examine_scene, dt=1 / rate), numbers):
                 rows.append(row)
                 if given.out is not None:
                     with given.out.open("a") as file:
                         print(json.dumps(row), file=file)
-    print(*summary(rows), sep="\n")
+    print(*summarize(rows), sep="\n")
     return 0
 
 

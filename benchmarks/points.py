@@ -17,7 +17,7 @@ Floats = NDArray[np.floating]
 
 
 def motions(n_points: int, blocks: tuple[int, ...] = BLOCKS, seed: int = 0) -> Floats:
-    """Motions of at most 1300 steps one below the other, (n_points, sum of blocks), float64.
+    """Draw motions of at most 1300 steps, one below the other, (n_points, sum of blocks).
 
     The first column of every block is time, 0 to 13 s; the others are sums of three sinusoids
     and correlated noise.
@@ -62,7 +62,7 @@ class Problem:
     def of(
         cls, points: Floats, n_components: int, blocks: tuple[int, ...] = BLOCKS
     ) -> "Problem":
-        """The points, and bins along their first column."""
+        """Start from Gaussians of bins along the first column of points."""
         bins = np.minimum(
             (points[:, 0] / DURATION * n_components).astype(int), n_components - 1
         )
@@ -89,8 +89,8 @@ class Problem:
         parameters = self.weights, self.means, self.covariances
         return BlockGaussianMixture.from_parameters(*parameters)
 
-    def joined(self, dtype: str = "float64") -> tuple[Floats, Floats, Floats]:
-        """The same in one block, for libraries that have no others.
+    def join_blocks(self, dtype: str = "float64") -> tuple[Floats, Floats, Floats]:
+        """Join all blocks to one, for libraries that have no others.
 
         Points (n, D), means (K, D) and covariances (K, D, D). The copies of time get noise of
         20 ms: without it a full covariance would have no full rank.
@@ -108,8 +108,8 @@ class Problem:
         means = np.concatenate(self.means, axis=1)
         return points, means.astype(dtype), covariances.astype(dtype)
 
-    def shuffled(self, seed: int = 0) -> "Problem":
-        """The same with the times exchanged among the points: time tells nothing any more.
+    def shuffle_times(self, seed: int = 0) -> "Problem":
+        """Exchange times among the points, so that time tells nothing any more.
 
         Every component then spans all times, so that none can be left out for being elsewhere
         in time; the start is of the points as they were, but for time.

@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import learned, skill
+from benchmarks.skill import fit_model, skill
 from benchmarks.timing import in_turns, medians, seconds
 from tpgmm_torch import Situation
 
@@ -15,8 +15,8 @@ __all__ = ["measure"]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Fifty situations from start to end, and one; plain, and with candidates."""
-    model = learned(settings)
+    """Measure fifty situations from start to end, and one; plain, and with candidates."""
+    model = fit_model(settings)
     situations = skill(settings).situations(settings.size(50, 2), settings.seed + 1000)
     first, last = float(model.time_[0]), float(model.time_[-1])
     time = torch.linspace(first, last, settings.size(1300, len(model.time_)))
@@ -24,7 +24,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     rounds = settings.rounds(3)
     one = situations[:1]
     work = [
-        ("eager", situations, {"candidates": False}, settings.asked("most", 5)),
+        ("eager", situations, {"candidates": False}, settings.target("most", 5)),
         ("with candidates", situations, {}, None),
         ("eager", one, {"candidates": False}, None),
         ("with candidates", one, {}, None),

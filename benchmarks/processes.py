@@ -24,7 +24,7 @@ LAUNCHER = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
 
 
 def measure(settings: Settings) -> Iterator[Row | Omitted]:
-    """One iteration over all points: halves in two gloo processes, and all in one."""
+    """Measure an iteration: halves of points in two gloo processes, and all in one."""
     n_points, n_components = settings.size(1_000_000, 2_600), settings.size(10, 3)
     rounds = settings.rounds(3)
     work = f"EM iteration, N = {n_points}, K = {n_components}, float64, two gloo processes"
@@ -33,7 +33,7 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
         return
     arguments = (n_points, n_components, rounds, settings.seed)
     taken = ask("processes", *arguments, launcher=LAUNCHER)
-    asked, other = settings.asked("faster", 1.85), "ours in one process"
+    asked, other = settings.target("faster", 1.85), "ours in one process"
     (wall, busy), (alone, busy_alone) = taken["two"], taken["one"]
     yield Row(work, "s", wall, other, alone, asked, rounds=rounds)
     note = "what is left when the other core is free: the row before needs two that are"
@@ -44,7 +44,7 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
 def _in_turns(
     processes: Processes, n_points: int, n_components: int, rounds: int, seed: int
 ) -> dict[str, list[float]]:
-    """Wall and processor seconds of an iteration, the larger ones of the two processes."""
+    """Take wall and processor seconds of an iteration, the larger of two processes."""
     torch.set_num_threads(1)
     problem = Problem.of(motions(n_points, seed=seed), n_components)
     half = len(problem.points) // 2

@@ -13,7 +13,7 @@ __all__ = ["flops_of_iteration", "peak"]
 
 @cache
 def peak(dtype: torch.dtype, size: int = 1024, rounds: int = 7) -> float:
-    """Floating-point operations per second of a product of square matrices, one thread."""
+    """Measure operations per second of a product of square matrices, one thread."""
     one = torch.randn(size, size, dtype=dtype, generator=torch.Generator().manual_seed(0))
     result = torch.empty_like(one)
     taken = [seconds(lambda: torch.mm(one, one, out=result)) for _ in range(rounds)]
@@ -21,7 +21,7 @@ def peak(dtype: torch.dtype, size: int = 1024, rounds: int = 7) -> float:
 
 
 def flops_of_iteration(n_points: int, n_components: int, blocks: Sequence[int]) -> float:
-    """Arithmetic of one EM iteration, E and M, over all points and components.
+    """Count the operations of an EM iteration, E and M, over all points and components.
 
     With F = sum_j (D_j (D_j + 1) / 2 + D_j) + 1 packed features (squares and products, the
     coordinates, 1), E is a product (K, F) (F, N), M is one (K, N) (N, F): 4 F K N operations.

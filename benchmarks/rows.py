@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-__all__ = ["Asked", "Kind", "Omitted", "Row", "markdown"]
+__all__ = ["Asked", "Kind", "Omitted", "Row", "format_table"]
 
 Kind = Literal["faster", "times", "most"]
 
@@ -65,14 +65,14 @@ class Row:
 
     @property
     def ratio(self) -> float | None:
-        """How many times our figure theirs is; None where one of them is not known."""
+        """Their figure as a multiple of ours; None where one of them is not known."""
         if self.theirs is None or self.ours <= 0:  # a difference of times within their noise
             return None
         return self.theirs / self.ours
 
     @property
-    def reached(self) -> bool | None:
-        """Whether the figure asked for was reached; None where none is asked for."""
+    def is_reached(self) -> bool | None:
+        """True if the figure asked for was reached; None where none is asked for."""
         if self.asked is None:
             return None
         if self.ours <= 0:  # a difference of times that is smaller than their noise
@@ -86,8 +86,8 @@ class Row:
         return self.ours <= self.asked.figure * self.theirs
 
     def record(self) -> dict[str, Any]:
-        """Everything, for JSON."""
-        derived = {"ratio": self.ratio, "reached": self.reached}
+        """Return everything, for JSON."""
+        derived = {"ratio": self.ratio, "reached": self.is_reached}
         return asdict(self) | derived | {"asked": self.asked and str(self.asked)}
 
 
@@ -99,7 +99,7 @@ class Omitted:
     reason: str
 
     def record(self) -> dict[str, Any]:
-        """Everything, for JSON."""
+        """Return everything, for JSON."""
         return {"work": self.work, "omitted": self.reason}
 
 
@@ -128,8 +128,8 @@ def _cells(row: dict[str, Any]) -> list[str]:
     return [*texts, row["asked"] or "", reached, share]
 
 
-def markdown(records: list[dict[str, Any]]) -> str:
-    """The rows as a table, then notes, then what was left out.
+def format_table(records: list[dict[str, Any]]) -> str:
+    """Format rows as a table in Markdown, then notes, then what was left out.
 
     Parameters
     ----------

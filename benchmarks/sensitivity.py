@@ -64,25 +64,23 @@ class Fold:
     link: str
 
     def measure(self, **parameters: Any) -> tuple[float, float]:
-        """Error of the link's path [mm, root mean square], and log-likelihood per instant."""
+        """Compute the error of the link's path [mm, rms], and log-likelihood per instant."""
         scale = parameters.pop("n_components", 1.0)
         k = round(scale * self.model.n_components)
         model = TaskParameterizedGMM(**self.model.get_params(deep=False))
         model.set_params(n_components=k, **parameters).fit(self.train)
-        situations = [Situation.of(one) for one in self.test]
+        situations = list(map(Situation.of, self.test))
         played = model.predict(situations, candidates=False)
         squares = []
-        for one, other in zip(played, self.test, strict=True):
-            here, there = (
-                self.robot.state(each.joints).position(self.link) for each in (one, other)
-            )
+        for paths in zip(played, self.test, strict=True):
+            here, there = (self.robot.state(p.joints).position(self.link) for p in paths)
             squares.append((here - there).square().sum(-1).mean())
         error = 1e3 * float(torch.stack(squares).mean().sqrt())
         return error, float(model.score(self.test))
 
 
 def _bottle(n: int, n_operators: int = 2) -> Fold:
-    """The bottle skill: n demonstrations of seed 0, and ten of seed 1000 to compare with."""
+    """Take n demonstrations of the bottle, and ten others to compare with."""
     skill = BottleShaking(rate=20)
     clock = DynamicTimeWarping(features=["directions"]).fit(shown := skill.demonstrations(n, 0))
     # without the operator of the joints the prior decides what the hands leave free
@@ -92,16 +90,16 @@ def _bottle(n: int, n_operators: int = 2) -> Fold:
     return Fold(clock.transform(shown), test, model, skill.robot, "r_hand")
 
 
-def _recorded(plan: Plan, name: str, folder: str) -> Iterator[Fold]:
-    """Real recordings, four of them left out, one at a time."""
+def _real_folds(plan: Plan, name: str, folder: str) -> Iterator[Fold]:
+    """Leave out four demonstrations of a recording, one at a time."""
     if not (plan.data / folder).is_dir():
         return
-    example = plan.loaded("examples.leave_one_out")
+    example = plan.load_module("examples.leave_one_out")
     recording = example.RECORDINGS[name](plan.data / folder)
     shown, operators = recording.demonstrations, next(iter(recording.models.values()))
     for index in np.linspace(0, len(shown) - 1, 4).astype(int):
         clock = example.ALIGNMENTS["dtw"](recording.robot)
-        train = clock.fit_transform([one for i, one in enumerate(shown) if i != index])
+        train = clock.fit_transform([shown[i] for i in range(len(shown)) if i != index])
         test = clock.transform([shown[index]])
         k, robot = recording.n_components, recording.robot
         model = TaskParameterizedGMM(k, operators, robot, random_state=0)
@@ -125,8 +123,8 @@ def parameter_sensitivity(plan: Plan) -> Iterator[str]:
         "bottle, 5": [_bottle(5)],
         "bottle, 10": [_bottle(10)],
         "bottle, 10, hands alone": [_bottle(10, 1)],
-        "g1": list(_recorded(plan, "g1", "g1_bottle")),
-        "honeytea": list(_recorded(plan, "honeytea", "honeytea_bimanual")),
+        "g1": list(_real_folds(plan, "g1", "g1_bottle")),
+        "honeytea": list(_real_folds(plan, "honeytea", "honeytea_bimanual")),
     }
     for name, values in VALUES.items():
         for value in values:
@@ -140,7 +138,7 @@ def parameter_sensitivity(plan: Plan) -> Iterator[str]:
 
 
 def _choices(fold: Fold) -> Iterator[str]:
-    """Which operators are chosen, and which demonstrations are unlike the others."""
+    """Describe the operators that are chosen, and demonstrations unlike the others."""
     shown = list(fold.train)
     for name, values in SELECTION.items():
         for value in values:
@@ -160,14 +158,14 @@ def _choices(fold: Fold) -> Iterator[str]:
 
 
 def _found(fold: Fold, index: int, offset: float, settings: Any) -> tuple[int, int]:
-    """Whether a demonstration is found whose bottle was seen aside; how many others are."""
+    """Count the demonstration with a bottle seen aside if it is found, and others."""
     shown = list(fold.train)
     bottle = shown[index].frames["bottle"]
     aside = bottle.position + torch.tensor([offset, 0.0, 0.0], dtype=torch.float64)
     moved = {"bottle": Frame(aside, bottle.orientation)}
     shown[index] = replace(shown[index], frames=moved)
     unlike = outlying_demonstrations(shown, bottle_operators(), fold.robot, **settings)
-    numbers = [one.episode for one in unlike]
+    numbers = [found.episode for found in unlike]
     return int(index in numbers), len(set(numbers) - {index})
 
 

@@ -47,17 +47,17 @@ class Settings:
     seed: int = 0
 
     def size(self, full: int, tiny: int) -> int:
-        """One of two sizes."""
+        """Return one of two sizes."""
         return full if self.full else tiny
 
     def rounds(self, full: int) -> int:
-        """How often to measure: as asked, or ``full`` times at full sizes, or once."""
+        """Return how often to measure: as asked, or ``full`` times at full sizes, or once."""
         return self.repeat or self.size(full, 1)
 
     def iterations(self, few: int, many: int) -> tuple[int, int]:
-        """How many iterations the two fits make whose difference is measured."""
+        """Return the numbers of iterations of two fits whose difference is measured."""
         return (few, many) if self.full else (1, 2)
 
-    def asked(self, kind: Kind, figure: float) -> Asked | None:
-        """What is to be reached; at tiny sizes, nothing."""
+    def target(self, kind: Kind, figure: float) -> Asked | None:
+        """Return the figure to reach; None at tiny sizes."""
         return Asked(kind, figure) if self.full else None

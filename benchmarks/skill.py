@@ -7,20 +7,20 @@ from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 
-__all__ = ["COMPONENTS", "aligned", "learned", "model", "skill"]
+__all__ = ["COMPONENTS", "align_demonstrations", "fit_model", "model", "skill"]
 
 COMPONENTS = 10
 
 
 @cache
 def skill(settings: Settings) -> BottleShaking:
-    """The generator, at 100 Hz in full size."""
+    """Make the generator, at 100 Hz in full size."""
     return BottleShaking(rate=settings.size(100, 10))
 
 
 @cache
-def aligned(settings: Settings) -> list[Demonstration]:
-    """Its demonstrations, on one time grid."""
+def align_demonstrations(settings: Settings) -> list[Demonstration]:
+    """Align its demonstrations in time."""
     demonstrations = skill(settings).demonstrations(settings.size(10, 3), settings.seed)
     return DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
 
@@ -28,14 +28,14 @@ def aligned(settings: Settings) -> list[Demonstration]:
 def model(
     settings: Settings, n_components: int = COMPONENTS, **options: object
 ) -> TaskParameterizedGMM:
-    """What learns it."""
+    """Make the model that learns it."""
     operators, robot = bottle_operators(), skill(settings).robot
     return TaskParameterizedGMM(n_components, operators, robot, **options)
 
 
 @cache
-def learned(
+def fit_model(
     settings: Settings, n_components: int = COMPONENTS, dtype: str = "float64"
 ) -> TaskParameterizedGMM:
-    """The model; not to be changed."""
-    return model(settings, n_components, dtype=dtype).fit(aligned(settings))
+    """Fit the model, which is not to be changed."""
+    return model(settings, n_components, dtype=dtype).fit(align_demonstrations(settings))

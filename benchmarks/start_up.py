@@ -17,7 +17,7 @@ MODULES = ("torch", "sklearn.base", "tpgmm_torch.estimator")
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """The package alone, which loads the rest when it is asked for, and all of it."""
+    """Measure the package alone, which loads the rest when it is asked for, and all."""
     rounds = settings.rounds(5)
     if settings.full:  # from now on, the files are in the system's cache
         ask("start_up", *MODULES)
@@ -27,7 +27,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         parts.append(ask("start_up", *MODULES))
     torch = median(part[0] for part in parts)
     note = "PyTorch and scikit-learn are loaded when first needed: the next rows"
-    asked, beside = settings.asked("times", 1.5), ("import torch", torch)
+    asked, beside = settings.target("times", 1.5), ("import torch", torch)
     yield Row(
         "import tpgmm_torch", "s", median(package), *beside, asked, rounds=rounds, note=note
     )

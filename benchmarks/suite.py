@@ -9,7 +9,7 @@ from time import perf_counter
 import torch
 
 from benchmarks.machine import machine
-from benchmarks.rows import markdown
+from benchmarks.rows import format_table
 from benchmarks.settings import CASES, Settings
 
 __all__ = ["run"]
@@ -23,6 +23,7 @@ def run(names: Sequence[str], settings: Settings) -> None:
     names : sequence of str
         Keys of ``CASES``.
     settings : Settings
+        How to measure.
     """
     torch.set_num_threads(1)
     settings.out.mkdir(parents=True, exist_ok=True)
@@ -42,13 +43,13 @@ def run(names: Sequence[str], settings: Settings) -> None:
         }
         path = settings.out / f"{name}.json"
         path.write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", "utf-8")
-        print(markdown(records), flush=True)
+        print(format_table(records), flush=True)
     if set(names) != {"curves"}:
         _write_table(settings)
 
 
 def _cpu_seconds() -> float:
-    """Of this process and of the children that have ended."""
+    """Return the processor time of this process and of children that have ended [s]."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
 
@@ -66,5 +67,5 @@ def _write_table(settings: Settings) -> None:
         f"{where['date']}.\n\n"
     )
     path = settings.out / "results.md"
-    path.write_text(heading + markdown(records), encoding="utf-8")
+    path.write_text(heading + format_table(records), encoding="utf-8")
     print(f"all rows: {path}")

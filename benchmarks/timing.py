@@ -13,7 +13,7 @@ Measurement = Callable[[], float]
 
 
 def seconds(work: Work, clock: Measurement | None = None) -> float:
-    """Wall time of one call [s], or another clock's, without garbage collection (as timeit)."""
+    """Take the time of a call [s] by a clock, without garbage collection, as timeit."""
     clock = clock or perf_counter
     gc.disable()
     try:
@@ -25,7 +25,7 @@ def seconds(work: Work, clock: Measurement | None = None) -> float:
 
 
 def per_call(work: Work, calls: int, clock: Measurement | None = None) -> Measurement:
-    """A measurement of many calls, for what takes microseconds: seconds of one."""
+    """Make a measurement of many calls, for what takes microseconds: seconds of one."""
 
     def repeat() -> None:
         for _ in range(calls):
@@ -40,7 +40,7 @@ def per_call(work: Work, calls: int, clock: Measurement | None = None) -> Measur
 def per_iteration(
     fit: Callable[[int], object], few: int, many: int, clock: Measurement | None = None
 ) -> Measurement:
-    """A measurement of one iteration, as the difference of two fits.
+    """Make a measurement of an iteration, as the difference of two fits.
 
     Parameters
     ----------
@@ -88,5 +88,5 @@ def in_turns(
 
 
 def medians(taken: Mapping[str, list[float]]) -> dict[str, float]:
-    """The median of each."""
+    """Compute the median of each."""
     return {name: statistics.median(values) for name, values in taken.items()}

@@ -121,21 +121,21 @@ class Recording:
 
 
 def pose(link: str, frame: str | None = None) -> Stack:
-    """Position and orientation of a link, seen from a frame or from the base."""
+    """Make the operator of a link's pose, seen from a frame or from the base."""
     if frame is None:
         return Stack(AbsolutePosition(link), AbsoluteOrientation(link))
     return Stack(RelativePosition(link, frame), RelativeOrientation(link, frame))
 
 
 def pouring(demonstration: Demonstration) -> float:
-    """When the right hand is turned furthest away from its start [s]."""
+    """Find when the right hand is turned furthest away from its start [s]."""
     names = [f"right.{part}" for part in ("qw", "qx", "qy", "qz")]
     turn = demonstration.reordered(names).joints
     return float(demonstration.time[int((turn @ turn[0]).abs().argmin())])
 
 
 def load_g1(folder: Path) -> Recording:
-    """Twenty times picking up a bottle."""
+    """Load twenty demonstrations of picking up a bottle."""
     urdf = Path(str(distribution("example-robot-data").locate_file(G1_URDF)))
     robot = Robot.from_urdf(urdf, [G1_HAND], joints=G1_ARMS, coordinates=FINGERS + THUMB)
     demonstrations = load_lerobot(
@@ -159,7 +159,7 @@ def load_g1(folder: Path) -> Recording:
 
 
 def load_honeytea(folder: Path) -> Recording:
-    """Nine times pouring honey into tea."""
+    """Load nine demonstrations of pouring honey into tea."""
     robot = Poses(("left", "right"))
     demonstrations = load_lerobot(
         folder,
@@ -174,7 +174,7 @@ def load_honeytea(folder: Path) -> Recording:
 
 
 def load_so101(folder: Path) -> Recording:
-    """Four times moving a small arm."""
+    """Load four motions of a small arm."""
     demonstrations = load_lerobot(folder, units="raw")
     robot, models = JointSpace(demonstrations[0].joint_names or ()), {"joints": (Canonical(),)}
     return Recording(demonstrations, robot, "", "end", "", models, 8, ())
@@ -184,7 +184,7 @@ RECORDINGS = {"g1": load_g1, "honeytea": load_honeytea, "so101": load_so101}
 
 
 def mean_joints(demonstrations: Sequence[Demonstration], robot: Kinematics) -> Tensor:
-    """Mean of aligned demonstrations, shape (T, n_joints)."""
+    """Average aligned demonstrations, shape (T, n_joints)."""
     joints = torch.stack([demonstration.joints for demonstration in demonstrations])
     for start in getattr(robot, "quaternion_starts", ()):
         turn = joints[..., start : start + 4]
@@ -194,7 +194,7 @@ def mean_joints(demonstrations: Sequence[Demonstration], robot: Kinematics) -> T
 
 
 def nearest(wanted: Demonstration, others: Sequence[Demonstration], frame: str) -> int:
-    """Which of the others has the most similar situation.
+    """Find the demonstration with the most similar situation.
 
     Start posture and object count equally; each of their numbers is standardised.
     """
@@ -214,19 +214,19 @@ def nearest(wanted: Demonstration, others: Sequence[Demonstration], frame: str) 
 
 
 def pose_at(recording: Recording, joints: Tensor, time: Tensor, instant: float) -> Frame:
-    """Pose of the link in question at the step nearest to an instant."""
+    """Compute the pose of the link in question at the step nearest to an instant."""
     state = recording.robot.state(joints[int((time - instant).abs().argmin())])
     return Frame(state.position(recording.link), state.orientation(recording.link))
 
 
 def degrees_between(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between orientations (..., 4) [deg]."""
+    """Compute the angle between orientations (..., 4) [deg]."""
     turn = quaternions.log(quaternions.product(a, quaternions.conjugate(b)))
     return torch.rad2deg(torch.linalg.vector_norm(turn, dim=-1))
 
 
 def errors(recording: Recording, joints: Tensor, wanted: Tensor) -> list[float]:
-    """Root mean square errors over time: link positions, orientations, joint angles."""
+    """Compute root mean square errors of link positions, orientations, joint angles."""
     found, truth = recording.robot.state(joints), recording.robot.state(wanted)
     squares = [
         (
@@ -244,12 +244,12 @@ def errors(recording: Recording, joints: Tensor, wanted: Tensor) -> list[float]:
 def one_fold(
     recording: Recording, held_out: int, alignment: str, parameters: Mapping[str, Any]
 ) -> dict[str, list[float]]:
-    """Errors of every method for one held-out episode, in the order of ``COLUMNS``."""
+    """Measure every method on a held-out episode, in the order of ``COLUMNS``."""
     test = recording.demonstrations[held_out]
-    train = [one for one in recording.demonstrations if one is not test]
+    train = [shown for shown in recording.demonstrations if shown is not test]
     clock = ALIGNMENTS[alignment](recording.robot)
     aligned = clock.fit_transform(train)
-    instants = [one.events[recording.event] for one in aligned]
+    instants = [shown.events[recording.event] for shown in aligned]
     usual = float(np.median(instants))
 
     proposals: dict[str, tuple[Tensor, float]] = {}
@@ -285,7 +285,7 @@ def leave_one_out(
     folds: Sequence[int] | None = None,
     **parameters: Any,
 ) -> dict[str, np.ndarray]:
-    """Errors by method, arrays of shape (folds, columns); ``parameters`` are the model's."""
+    """Measure errors by method, (folds, columns); ``parameters`` are the model's."""
     folds = range(len(recording.demonstrations)) if folds is None else folds
     rows = [one_fold(recording, fold, alignment, parameters) for fold in folds]
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -294,14 +294,14 @@ def leave_one_out(
 def likelihoods(
     recording: Recording, alignment: str = "dtw", folds: Sequence[int] | None = None
 ) -> dict[str, np.ndarray]:
-    """Mean log-likelihood per step of held-out episodes, arrays of shape (folds, K)."""
+    """Compute mean log-likelihoods per step of held-out episodes, shape (folds, K)."""
     operators = next(iter(recording.models.values()))
     found: dict[str, list[list[float]]] = {str(setting): [] for setting in SHRINKAGES}
     for fold in range(len(recording.demonstrations)) if folds is None else folds:
         test = recording.demonstrations[fold]
         clock = ALIGNMENTS[alignment](recording.robot)
         aligned = clock.fit_transform(
-            [one for one in recording.demonstrations if one is not test]
+            [shown for shown in recording.demonstrations if shown is not test]
         )
         wanted = clock.transform([test])
         for setting in SHRINKAGES:
@@ -319,7 +319,7 @@ def likelihoods(
 
 
 def table(results: Mapping[str, np.ndarray]) -> str:
-    """Median and 90th percentile over the folds, one line per method."""
+    """Format median and 90th percentile over the folds, one line per method."""
     lines = [f"{'median / 90th percentile':26}" + "".join(f"{c:>16}" for c in COLUMNS)]
     for name, values in results.items():
         middle, high = np.quantile(values, (0.5, 0.9), axis=0)
@@ -332,7 +332,7 @@ def table(results: Mapping[str, np.ndarray]) -> str:
 
 
 def intervals(results: Mapping[str, np.ndarray]) -> str:
-    """Where the median lies, one line per method.
+    """Compute intervals of the median, one line per method.
 
     The interval ends at two of the episodes' own values and holds with 95 % or more whatever
     their distribution (the sign test turned round); six episodes are the fewest that give one.

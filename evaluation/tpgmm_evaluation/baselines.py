@@ -1,4 +1,4 @@
-"""ACT, Diffusion Policy and a perceptron, trained from memory until they stop improving."""
+"""ACT and Diffusion Policy, trained from memory until they stop improving."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies import ACTConfig, DiffusionConfig, PreTrainedPolicy
+from lerobot.policies.factory import get_policy_class
 from lerobot.processor import make_default_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -19,8 +20,6 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import state_features
 from tpgmm_evaluation.policies.elapsed_time import tell_time
 from tpgmm_evaluation.policies.episodes import Episodes, Windows, policy_stride
-from tpgmm_evaluation.policies.perceptron import PerceptronConfig
-from tpgmm_evaluation.policy_classes import policy_class
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["RECIPES", "Recipe", "Training", "train"]
@@ -75,7 +74,7 @@ class Recipe:
     falls: int = 2
 
     def describe(self) -> dict[str, Any]:
-        """For the record: everything as plain values."""
+        """Return everything as plain values, for the record."""
         return {**asdict(self), "config": self.config.__name__, "options": dict(self.options)}
 
 
@@ -117,8 +116,7 @@ DIFFUSION = Recipe(
     },
     "MIN_MAX",
 )
-PERCEPTRON = Recipe(PerceptronConfig, {}, "MEAN_STD")
-PLAIN = {"act": ACT, "act-large": ACT_LARGE, "diffusion": DIFFUSION, "mlp": PERCEPTRON}
+PLAIN = {"act": ACT, "act-large": ACT_LARGE, "diffusion": DIFFUSION}
 RECIPES = {
     name: recipe
     for kind, plain in PLAIN.items()
@@ -189,13 +187,13 @@ def train(
     if recipe.phase:
         training, validation = (episodes.with_time() for episodes in (training, validation))
     config = _configure(recipe, training)
-    policy = policy_class(config)(config)
+    policy = get_policy_class(config.type)(config)
     processors = make_default_pre_post_processors(config, _statistics(training))
     preprocessor, postprocessor = processors
     result = Training(policy, processors, recipe.rate, recipe.describe())
     deltas = config.observation_delta_indices, config.action_delta_indices
     windows, held_out = (
-        Windows(_normalized(episodes, preprocessor), episodes.bounds, stride, *deltas)
+        Windows(_normalize(episodes, preprocessor), episodes.bounds, stride, *deltas)
         for episodes in (training, validation)
     )
     rows = torch.linspace(0, len(held_out) - 1, CHECKED).long()
@@ -232,34 +230,46 @@ class _Learner:
         began = time.process_time()
         best, best_weights, waited, falls = math.inf, None, 0, 0
         while not self.result.outcome:
-            losses = [self._step() for _ in range(self.recipe.check_every)]
-            loss, error = self._validate()
-            point = {
-                "step": self.steps,
-                "seconds": time.process_time() - began,
-                "train_loss": sum(losses) / len(losses),
-                "validation_loss": loss,
-                "validation_error": error,
-            }
-            self.result.curve.append(point)
+            point = self._measure_block(began)
+            error, seconds = point["validation_error"], point["seconds"]
             report(" ".join(f"{key} {value:.5g}" for key, value in point.items()))
             waited = 0 if error < 0.99 * best else waited + 1
             if error < best:
                 best, best_weights = error, deepcopy(self.average.state_dict())
             # towards the end of the budget the rate falls by itself, for the last refinement
-            late = point["seconds"] > budget * (1 - 0.4 ** (falls + 1))
+            late = seconds > budget * (1 - 0.4 ** (falls + 1))
             if waited == self.recipe.patience or (late and falls < self.recipe.falls):
                 falls, waited = falls + 1, 0
-                for group in self.optimizer.param_groups:
-                    group["lr"] /= 3
-            if falls > self.recipe.falls:
-                self.result.outcome = "the validation error stopped falling"
-            elif point["seconds"] > budget:
-                self.result.outcome = f"the budget of {budget / 60:g} min was used up"
+                self._lower_rate()
+            self.result.outcome = self._outcome(falls, seconds, budget)
         if best_weights is None:
             raise DataError(f"training diverged: the validation error is {error}")
         self.policy.load_state_dict(best_weights)
         self.policy.eval()
+
+    def _measure_block(self, began: float) -> dict[str, float]:
+        """Train until the next validation; add its point to the curve."""
+        losses = [self._step() for _ in range(self.recipe.check_every)]
+        loss, error = self._validate()
+        point = {
+            "step": self.steps,
+            "seconds": time.process_time() - began,
+            "train_loss": sum(losses) / len(losses),
+            "validation_loss": loss,
+            "validation_error": error,
+        }
+        self.result.curve.append(point)
+        return point
+
+    def _outcome(self, falls: int, seconds: float, budget: float) -> str:
+        """Return why training ends; nothing while it goes on."""
+        if falls > self.recipe.falls:
+            return "the validation error stopped falling"
+        return f"the budget of {budget / 60:g} min was used up" if seconds > budget else ""
+
+    def _lower_rate(self) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] /= 3
 
     def _step(self) -> float:
         batch = self.windows.at(torch.randint(len(self.windows), (self.recipe.batch_size,)))
@@ -281,7 +291,7 @@ class _Learner:
 
     @torch.no_grad()
     def _validate(self) -> tuple[float, float]:
-        """Loss and error of the average weights, with the same noise every time."""
+        """Compute loss and error of the average weights, with the same noise every time."""
         policy, config, batch = self.average, self.policy.config, self.held_out
         with torch.random.fork_rng():
             torch.manual_seed(0)
@@ -296,8 +306,8 @@ class _Learner:
         return float(loss), float(errors[valid].mean())
 
 
-def _normalized(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:
-    """All rows through the preprocessor at once."""
+def _normalize(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:
+    """Pass all rows through the preprocessor at once."""
     rows = preprocessor(episodes.columns)
     return {name: rows[name] for name in episodes.columns}
 
@@ -314,7 +324,7 @@ def _configure(recipe: Recipe, training: Episodes) -> PreTrainedConfig:
 
 
 def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
-    """Statistics with room at both ends, and no division by the spread of a constant."""
+    """Compute statistics with room at both ends, and without the spread of constants."""
     statistics = {}
     for key, values in training.columns.items():
         std, low, high = values.std(0), values.min(0).values, values.max(0).values
@@ -330,7 +340,7 @@ def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
 
 
 def _action_scale(postprocessor: Any, config: PreTrainedConfig) -> Tensor:
-    """Size of a unit of the normalised action [rad]."""
+    """Compute the size of a unit of the normalised action [rad]."""
     zero = torch.zeros(1, *config.output_features[ACTION].shape)
     scale: Tensor = (postprocessor(zero + 1) - postprocessor(zero))[0]
     return scale

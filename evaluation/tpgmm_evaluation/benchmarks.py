@@ -92,7 +92,7 @@ class Benchmark(ABC):
 
     @abstractmethod
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """The subspaces in which TP-GMM learns.
+        """Return the subspaces in which TP-GMM learns.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class _HandlingBenchmark(Benchmark):
 
     @abstractmethod
     def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
-        """Those of the pool's demonstrations that have these numbers."""
+        """Return the demonstrations of the pool with these numbers."""
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
         """Let the environment follow generated demonstrations, and keep what succeeds."""
@@ -185,7 +185,7 @@ class _HandlingBenchmark(Benchmark):
                     f"{n} are asked for"
                 )
             for number, motion in zip(chosen, self.motions(chosen, seed), strict=True):
-                measured, success = self._follow(env, number, motion)
+                measured, success = self.follow(env, number, motion)
                 tried.append(success)
                 if success:
                     kept.append((measured, _references(motion)))
@@ -200,7 +200,7 @@ class _HandlingBenchmark(Benchmark):
         return tried
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
-        """The options with which an episode begins as a demonstration does."""
+        """Return the options with which an episode begins as a demonstration does."""
         start = {"joints": motion.joints[0].numpy()}
         for name in self.objects:
             pose = motion.frame(name)
@@ -208,8 +208,8 @@ class _HandlingBenchmark(Benchmark):
             start[name] = torch.cat((pose.position, pose.orientation)).numpy()
         return start
 
-    def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
-        """Measures of the environment following a motion; whether it succeeds."""
+    def follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
+        """Let the environment follow a motion; return what it measures, and its success."""
         observation, info = env.reset(seed=seed, options=self._start(motion))
         measured, seen, done = [], [], False
         references = _references(motion).numpy()
@@ -245,7 +245,7 @@ class _BottleTask(_HandlingBenchmark):
         self.robot = self.skill.robot
 
     def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
-        """Of the skill's generator."""
+        """Generate them by the skill."""
         pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
         return [pool[number] for number in numbers]
 
@@ -259,7 +259,7 @@ class BottleBenchmark(_BottleTask):
     generator = partial(BottleShaking, steady_rhythm=True)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """Both hands seen from the bottle, and the joints."""
+        """Return both hands seen from the bottle, and the joints."""
         return bottle_operators(orientation)
 
 
@@ -272,7 +272,7 @@ class CarryBenchmark(_BottleTask):
     generator = CarryAndPut
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """Both hands seen from the bottle and the tray, and the joints.
+        """Return both hands seen from the bottle and the tray, and the joints.
 
         With what is held, the bottle from the tray, and one hand from the other.
         """
@@ -316,22 +316,22 @@ class SuiteBenchmark(_HandlingBenchmark):
         self.task, self.figures = self.skill.description, {**self.skill.figures, **PEAKS}
 
     def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
-        """Of the task's expert."""
+        """Let the task's expert show them."""
         return self.skill.demonstrations(self.POOL + self.RESERVED, seed, self.rate, numbers)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """As the task says."""
+        """Return those of the task."""
         return self.skill.operators(orientation, held)
 
 
 def _poses(links: Sequence[str], frame: str, orientation: bool) -> Stack:
-    """Where links, or objects, are seen from a frame."""
+    """Make the operators of links, or objects, seen from a frame."""
     kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
     return Stack(*(kind(link, frame) for link in links for kind in kinds))
 
 
 def _references(motion: Demonstration) -> torch.Tensor:
-    """The joints one step ahead."""
+    """Return the joints one step ahead."""
     return torch.cat((motion.joints[1:], motion.joints[-1:]))
 
 
@@ -359,7 +359,7 @@ class AlohaBenchmark(Benchmark):
         self.robot = aloha_robot()
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """Both grippers seen from the objects, and the joints."""
+        """Return both grippers seen from the objects, and the joints."""
         return aloha_operators(self.options["task"], orientation)
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
@@ -401,7 +401,7 @@ BENCHMARKS: dict[str, Callable[[int | None, Mapping[str, Any] | None], Benchmark
 def benchmark(
     name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Benchmark:
-    """A benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`."""
+    """Return a benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`."""
     if name not in BENCHMARKS:
         raise UnknownNameError("environment", name, "the comparison", BENCHMARKS)
     return BENCHMARKS[name](rate, options)

@@ -15,7 +15,7 @@ from tpgmm_evaluation.variants import Variant
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Cell", "Results", "write_json"]
+__all__ = ["Cell", "Results", "parse_numbers", "write_json"]
 
 
 @dataclass(frozen=True, order=True)
@@ -45,7 +45,7 @@ class Cell:
     @property
     def training(self) -> str:
         """Name of the trained policy, which cells of all conditions and settings share."""
-        return self._named(self.variant.base)
+        return self._name(self.variant.base)
 
     @property
     def variant(self) -> Variant:
@@ -56,10 +56,18 @@ class Cell:
     def key(self) -> str:
         """Name of the cell."""
         policy = re.sub(r"[^\w.+=:-]+", "_", self.policy.replace(" --policy.", "+"))
-        return f"{self._named(policy)}-{self.condition}"
+        return f"{self._name(policy)}-{self.condition}"
 
-    def _named(self, policy: str) -> str:
+    def _name(self, policy: str) -> str:
         return f"{self.env}-{policy}-n{self.demonstrations}-s{self.seed}"
+
+
+def parse_numbers(text: str, option: str) -> list[int]:
+    """Read the numbers of an option of the command line, joined by commas."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise DataError(f"{option} takes numbers like 5,10,25, got {text!r}") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -75,7 +83,7 @@ class Results:
         self.folder = folder
 
     def path(self, cell: Cell) -> Path:
-        """Where the result of a cell is."""
+        """Return the file of a cell."""
         return self.folder / f"{cell.key}.json"
 
     def write(self, cell: Cell, result: Mapping[str, Any]) -> None:
@@ -90,7 +98,7 @@ class Results:
         write_json(self.path(cell), {**content, "checksum": _checksum(content)})
 
     def read(self, cell: Cell) -> dict[str, Any] | None:
-        """The result of a cell; None if it is missing."""
+        """Read the result of a cell; None if it is missing."""
         path = self.path(cell)
         if not path.exists():
             return None
@@ -99,8 +107,17 @@ class Results:
             raise DataError(f"{path} holds another cell, {content['cell']}")
         return content
 
+    def has(self, cell: Cell, say: Callable[[str], None]) -> bool:
+        """Return whether a cell is finished; ``say`` is told of a damaged file, which goes."""
+        try:
+            return self.read(cell) is not None
+        except DataError as error:
+            say(f"{error}; the cell is run again")
+            self.path(cell).unlink()
+            return False
+
     def read_all(self, say: Callable[[str], None]) -> list[dict[str, Any]]:
-        """All results in the folder, in the order of their names.
+        """Read all results in the folder, in the order of their names.
 
         Parameters
         ----------

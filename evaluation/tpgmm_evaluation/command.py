@@ -68,9 +68,9 @@ def compare(
     policies : ``NAME,...``
         Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, as in 0.1.0),
         tpgmm-even-clock, tpgmm-places (objects are where they were at first),
-        tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, key-poses-posture, dmp,
-        promp; act, act-large (LeRobot's sizes), diffusion, mlp, knn, each also with the time,
-        -phase; nearest, mean; all, of tpgmm with all parts and without orientation, of act the
+        tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, key-poses-posture; act,
+        act-large (LeRobot's sizes), diffusion, each also with the time, -phase; nearest,
+        mean; all, of tpgmm with all parts and without orientation, of act the
         small one; or quick: of these, all that no gradient trains. A tpgmm may have settings:
         'tpgmm --policy.FIELD=VALUE'. Beside disturbances the open loop is always there.
     demonstrations : ``N,...``
@@ -98,6 +98,7 @@ def compare(
     """
     from lerobot_env_bimanual.disturbances import NOMINAL
     from tpgmm_evaluation import compare as module
+    from tpgmm_evaluation.cells import parse_numbers
     from tpgmm_evaluation.settings import Settings
     from tpgmm_evaluation.variants import OPEN_LOOP
 
@@ -118,8 +119,8 @@ def compare(
         settings,
         out,
         chosen,
-        _numbers(demonstrations, "--demonstrations"),
-        _numbers(seeds, "--seeds"),
+        parse_numbers(demonstrations, "--demonstrations"),
+        parse_numbers(seeds, "--seeds"),
         tried,
         workers,
         typer.echo,
@@ -131,18 +132,18 @@ def compare(
 
 
 def _environments(text: str) -> list[str]:
-    """The names that are meant, each once."""
+    """Return the environments that are meant, each once."""
     from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
 
     groups = {f"suite-{robot}": list(tasks) for robot, tasks in OTHER_ROBOTS.items()}
     others = {"aloha_state", "aloha_insertion"}.union(*groups.values())
     groups["suite"] = [name for name in BENCHMARKS if name not in others]
     groups["all"] = list(BENCHMARKS)
-    return _named(text, groups)
+    return _expand(text, groups)
 
 
 def _policies(text: str) -> list[str]:
-    """The policies that are meant, each once."""
+    """Return the policies that are meant, each once."""
     from tpgmm_evaluation.baselines import RECIPES
     from tpgmm_evaluation.jobs import POLICIES
     from tpgmm_evaluation.trainings import ABLATIONS
@@ -150,16 +151,9 @@ def _policies(text: str) -> list[str]:
     rare = {*ABLATIONS, "act-large", "act-large-phase"} - {"tpgmm-position-only"}
     usual = [name for name in POLICIES if name not in rare]
     groups = {"all": usual, "quick": [name for name in usual if name not in RECIPES]}
-    return _named(text, groups)
+    return _expand(text, groups)
 
 
-def _named(text: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
+def _expand(text: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
     parts = (groups.get(part, [part]) for part in text.split(","))
     return list(dict.fromkeys(name for names in parts for name in names))
-
-
-def _numbers(text: str, option: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise options.refuse(f"{option} takes numbers like 5,10,25, got {text!r}") from None

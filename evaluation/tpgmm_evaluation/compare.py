@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
-from typing import Any
 
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_evaluation.baselines import RECIPES
@@ -20,7 +19,7 @@ from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.variants import NAMED, Variant
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["ALL_CONDITIONS", "Comparison", "compare", "rewrite_report"]
+__all__ = ["ALL_CONDITIONS", "Comparison", "choose_conditions", "compare", "rewrite_report"]
 
 #: Stands for every condition that an environment has.
 ALL_CONDITIONS = "all"
@@ -90,29 +89,109 @@ def compare(
         If the folder holds results of other settings.
     """
     tasks = (settings,) if isinstance(settings, Settings) else tuple(settings)
-    grids = _grids(tasks, policies, demonstrations, seeds, conditions, say)
+    _check(tasks, policies, demonstrations, seeds)
+    known = choose_conditions(tasks, conditions, say)
     for task in tasks:
         task.keep(out / task.env / "settings.json")
-    left = [
-        [cell for cell in cells if not _finished(Results(out / task.env / "cells"), cell, say)]
-        for task, cells in zip(tasks, grids, strict=True)
-    ]
-    total = sum(map(len, grids))
-    say(f"{total} cells, {total - sum(map(len, left))} of them finished before")
+    pending, total = [], 0
+    for task, names in zip(tasks, known, strict=True):
+        cells = dict.fromkeys(
+            Cell(task.env, policy, n, seed, name)
+            for n, policy, seed, name in product(demonstrations, policies, seeds, names)
+        )
+        results, total = Results(out / task.env / "cells"), total + len(cells)
+        pending.append([cell for cell in cells if not results.has(cell, say)])
+    say(f"{total} cells, {total - sum(map(len, pending))} of them finished before")
     groups = []
-    for task, cells, pending in zip(tasks, grids, left, strict=True):
-        for seed in sorted({cell.seed for cell in pending}):
-            say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
-            record(out / task.env, task, max(cell.demonstrations for cell in cells), seed)
-        pending.sort(key=lambda cell: cell.training)  # stable
-        groups += [
-            (out / task.env, task, list(same))
-            for _, same in groupby(pending, key=lambda cell: cell.training)
-        ]
+    for task, left in zip(tasks, pending, strict=True):
+        _record(out / task.env, task, left, max(demonstrations), say)
+        groups += _by_training(out / task.env, task, left)
     failures = _run(groups, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
     return Comparison(total - len(failures), failures)
+
+
+def _record(
+    folder: Path, task: Settings, cells: Sequence[Cell], n: int, say: Callable[[str], None]
+) -> None:
+    """Record the episodes that the trainings of cells learn from."""
+    for seed in sorted({cell.seed for cell in cells}):
+        say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
+        record(folder, task, n, seed)
+
+
+def _by_training(
+    folder: Path, task: Settings, cells: Sequence[Cell]
+) -> list[tuple[Path, Settings, list[Cell]]]:
+    """Group cells by their training, whose cells run one after the other."""
+    ordered = sorted(cells, key=lambda cell: cell.training)  # stable
+    groups = groupby(ordered, key=lambda cell: cell.training)
+    return [(folder, task, list(same)) for _, same in groups]
+
+
+def _check(
+    tasks: Sequence[Settings],
+    policies: Sequence[str],
+    demonstrations: Sequence[int],
+    seeds: Sequence[int],
+) -> None:
+    """Check that there is something to compare, and that its policies exist."""
+    for policy in policies:
+        if Variant.parse(policy).base not in POLICIES:
+            known = (*POLICIES, *NAMED)
+            raise UnknownNameError("policy", policy, "the comparison", known)
+    if not all((tasks, policies, seeds, demonstrations)) or min(demonstrations) < 1:
+        raise DataError(
+            "a comparison needs environments, policies, seeds and numbers of demonstrations "
+            f"> 0, got {[task.env for task in tasks]}, {list(policies)}, {list(seeds)}, "
+            f"{list(demonstrations)}"
+        )
+
+
+def choose_conditions(
+    tasks: Sequence[Settings], conditions: Sequence[str], say: Callable[[str], None]
+) -> list[list[str]]:
+    """Choose for each environment those of the conditions that it knows.
+
+    Parameters
+    ----------
+    tasks : sequence of Settings
+        Of each environment.
+    conditions : sequence of str
+        As for :func:`compare`.
+    say : callable
+        Told of a condition that some of the environments do not know.
+
+    Raises
+    ------
+    UnknownNameError
+        If none of them knows one.
+    """
+    every = [task.benchmark().all_conditions for task in tasks]  # an unknown task ends here
+    for name in dict.fromkeys(conditions):
+        unknown = [t.env for t in tasks if name != ALL_CONDITIONS and not t.knows(name)]
+        if len(unknown) == len(tasks):
+            tasks[0].disturb(name)  # says what it knows
+        if unknown:
+            say(f"{', '.join(unknown)}: not tried in {name!r}, which is unknown there")
+    return [
+        _expand_conditions(task, conditions, names)
+        for task, names in zip(tasks, every, strict=True)
+    ]
+
+
+def _expand_conditions(
+    task: Settings, conditions: Sequence[str], every: Sequence[str]
+) -> list[str]:
+    """List the conditions that an environment knows, each once."""
+    chosen: list[str] = []
+    for name in conditions:
+        if name == ALL_CONDITIONS:
+            chosen += every
+        elif task.knows(name):
+            chosen.append(name)
+    return list(dict.fromkeys(chosen))
 
 
 def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:
@@ -135,7 +214,7 @@ def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:
     DataError
         If no comparison is there.
     """
-    if not _kept(out):
+    if not _settings_files(out):
         raise DataError(
             f"{out} holds no comparison: there is no ENVIRONMENT/settings.json in it. Give the "
             "folder that `tpgmm compare --out` wrote"
@@ -143,8 +222,8 @@ def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:
     return _report(out, {}, "", say)
 
 
-def _kept(out: Path) -> list[Path]:
-    """The settings of all environments in a folder, in the order of the registry."""
+def _settings_files(out: Path) -> list[Path]:
+    """Find the settings of all environments in a folder, in the order of the registry."""
     names = [*BENCHMARKS, *sorted(path.name for path in out.glob("*") if path.is_dir())]
     paths = [out / name / "settings.json" for name in dict.fromkeys(names)]
     return [path for path in paths if path.exists()]
@@ -155,75 +234,9 @@ def _report(
 ) -> Path:
     tasks = [
         Task(path.parent, Settings.read(path), Results(path.parent / "cells").read_all(say))
-        for path in _kept(out)
+        for path in _settings_files(out)
     ]
     return write_summary(out, tasks, failures, command)
-
-
-def _grids(
-    tasks: Sequence[Settings],
-    policies: Sequence[str],
-    demonstrations: Sequence[int],
-    seeds: Sequence[int],
-    conditions: Sequence[str],
-    say: Callable[[str], None],
-) -> list[list[Cell]]:
-    """The cells of each environment."""
-    for policy in policies:
-        if Variant.parse(policy).base not in POLICIES:
-            known = (*POLICIES, *NAMED)
-            raise UnknownNameError("policy", policy, "the comparison", known)
-    if not tasks or not policies or not seeds or not demonstrations or min(demonstrations) < 1:
-        raise DataError(
-            "a comparison needs environments, policies, seeds and numbers of demonstrations "
-            f"> 0, got {[task.env for task in tasks]}, {list(policies)}, {list(seeds)}, "
-            f"{list(demonstrations)}"
-        )
-    tried = _tried(tasks, conditions, say)
-    return [
-        [
-            Cell(task.env, policy, n, seed, condition)
-            for n in dict.fromkeys(demonstrations)
-            for policy in dict.fromkeys(policies)
-            for seed in dict.fromkeys(seeds)
-            for condition in known
-        ]
-        for task, known in zip(tasks, tried, strict=True)
-    ]
-
-
-def _tried(
-    tasks: Sequence[Settings], conditions: Sequence[str], say: Callable[[str], None]
-) -> list[list[str]]:
-    """Which conditions each environment is tried in: of those asked for, the ones it knows."""
-    known = [task.benchmark().all_conditions for task in tasks]  # an unknown task ends here
-    tried: list[dict[str, Any]] = [{} for _ in tasks]
-    for condition in conditions:
-        unknown: dict[str, UnknownNameError] = {}
-        for task, names, every in zip(tasks, tried, known, strict=True):
-            if condition == ALL_CONDITIONS:
-                names |= dict.fromkeys(every)
-                continue
-            try:
-                task.disturbed(condition)
-            except UnknownNameError as error:
-                unknown[task.env] = error
-            else:
-                names[condition] = None
-        if len(unknown) == len(tasks):
-            raise next(iter(unknown.values()))
-        if unknown:
-            say(f"{', '.join(unknown)}: not tried in {condition!r}, which is unknown there")
-    return [list(names) for names in tried]
-
-
-def _finished(results: Results, cell: Cell, say: Callable[[str], None]) -> bool:
-    try:
-        return results.read(cell) is not None
-    except DataError as error:
-        say(f"{error}; the cell is run again")
-        results.path(cell).unlink()
-        return False
 
 
 def _run(

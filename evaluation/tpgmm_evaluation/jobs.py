@@ -29,7 +29,7 @@ POLICIES = tuple(TRAININGS)
 RECORD = "training.json"
 PACKAGES = (
     *("tpgmm-torch", "lerobot", "torch", "numpy", "scikit-learn", "gymnasium", "mujoco"),
-    *("diffusers", "mink", "movement_primitives"),
+    *("diffusers", "mink"),
 )
 
 
@@ -57,7 +57,7 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
     results = Results(folder / "cells")
     for cell in cells:
         runner = Runner.load(directory, cell.variant.arguments)
-        options = settings.disturbed(cell.condition)
+        options = settings.disturb(cell.condition)
         config = make_env_config(settings.benchmark().env, fps=training["fps"], **options)
         began, used = time.perf_counter(), time.process_time()
         rows = evaluate(runner, config, settings.seeds)
@@ -79,7 +79,7 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Properties of the machine that results may depend on, without its name."""
+    """Describe what results may depend on of the machine, without its name."""
     return {
         "architecture": platform.machine(),
         "system": platform.system(),

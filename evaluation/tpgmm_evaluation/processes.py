@@ -78,7 +78,7 @@ def _call(function: Callable[..., None], job: tuple[Any, ...], log: Path) -> Non
 
 
 def _end_with_parent() -> None:
-    """A job must not go on alone when its run was killed, and get in the way of the next."""
+    """End with a run that was killed, so as not to get in the way of the next."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

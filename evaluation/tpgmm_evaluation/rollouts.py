@@ -17,13 +17,18 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
-from tpgmm_evaluation.policy_classes import policy_class
+from tpgmm_evaluation.policies.replay import NearestPolicy
+from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 
 __all__ = ["Runner", "evaluate", "latency"]
 
+#: Policies of this package, which LeRobot does not find by the type of a configuration.
+BASELINES: dict[str, Any] = {
+    kind.name: kind for kind in (KeyPosesPolicy, MeanPolicy, NearestPolicy)
+}
 #: Environments that are stepped together.
 BATCH = 50
 #: Actions whose time is taken, after as many to warm up as ``WARM_UP``.
@@ -43,7 +48,8 @@ class Runner:
         """Read a pretrained directory as LeRobot does, with ``--field=value`` on top."""
         config = PreTrainedConfig.from_pretrained(directory, cli_overrides=list(overrides))
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it loads
-            policy = policy_class(config).from_pretrained(directory, config=config)
+            kind = BASELINES.get(config.type) or get_policy_class(config.type)
+            policy = kind.from_pretrained(directory, config=config)
         return cls(policy, *make_pre_post_processors(config, pretrained_path=str(directory)))
 
     def reset(self) -> None:
@@ -53,7 +59,7 @@ class Runner:
 
     @torch.inference_mode()
     def act(self, observation: dict[str, Any]) -> Any:
-        """The action for what LeRobot's ``preprocess_observation`` makes of an observation."""
+        """Return the action for an observation that LeRobot preprocessed."""
         return self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
 
 
@@ -80,7 +86,7 @@ class _Outcomes:
 
 
 def _figures(info: Mapping[str, Any], index: int) -> dict[str, float]:
-    """The scalar figures of one environment, which gymnasium collected in arrays."""
+    """Return the scalar figures of one environment, which gymnasium collects in arrays."""
     return {
         key: float(values[index])
         for key, values in info.items()
@@ -93,7 +99,7 @@ def _figures(info: Mapping[str, Any], index: int) -> dict[str, float]:
 
 
 def _environments(config: EnvConfig, n: int) -> contextlib.closing[gym.vector.VectorEnv]:
-    """``n`` environments of one task, as LeRobot makes them."""
+    """Make ``n`` environments of one task, as LeRobot does."""
     [tasks] = make_env(config, n_envs=n).values()
     [vector] = tasks.values()
     return contextlib.closing(vector)
@@ -140,7 +146,7 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
 
 
 def latency(runner: Runner, config: EnvConfig) -> dict[str, float]:
-    """How long an action takes for one robot, from the raw observation on.
+    """Measure how long an action takes for one robot, from the raw observation on.
 
     Returns
     -------

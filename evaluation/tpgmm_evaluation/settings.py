@@ -57,23 +57,23 @@ class Settings:
 
     @property
     def seeds(self) -> range:
-        """Of the evaluation episodes."""
+        """Seeds of the evaluation episodes."""
         return range(self.evaluation_seed, self.evaluation_seed + self.episodes)
 
     def drawn(self, seed: int) -> int:
-        """The seed of the demonstrations from which the training with a seed learns."""
+        """Return the seed of the demonstrations that the training with a seed learns from."""
         return seed if self.demonstration_seed is None else self.demonstration_seed
 
     def episodes_in(self, folder: Path, seed: int) -> Path:
-        """Where in the folder of an environment the training with a seed finds episodes."""
+        """Return the folder, in that of an environment, with the episodes of a training."""
         return folder / "episodes" / f"s{self.drawn(seed)}"
 
     def benchmark(self) -> Benchmark:
-        """The environment that is meant."""
+        """Return the environment that is meant."""
         return benchmark(self.env, self.rate, self.options)
 
-    def disturbed(self, condition: str) -> dict[str, Any]:
-        """The environment's options in a condition, disturbances joined by ``+``."""
+    def disturb(self, condition: str) -> dict[str, Any]:
+        """Return the environment's options in a condition, disturbances joined by ``+``."""
         benchmark = self.benchmark()
         options, others = benchmark.options, []
         for name in () if condition == NOMINAL else condition.split("+"):
@@ -88,6 +88,14 @@ class Settings:
             parse_condition("+".join(others))
             options = {**options, "condition": "+".join(others)}
         return options
+
+    def knows(self, condition: str) -> bool:
+        """Return whether the environment has a condition."""
+        try:
+            self.disturb(condition)
+        except UnknownNameError:
+            return False
+        return True
 
     def keep(self, path: Path) -> None:
         """Write to a file, or check that it says the same.

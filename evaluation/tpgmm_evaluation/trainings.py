@@ -18,11 +18,8 @@ from tpgmm_evaluation.baselines import RECIPES, Training, train
 from tpgmm_evaluation.benchmarks import Benchmark
 from tpgmm_evaluation.cells import Cell
 from tpgmm_evaluation.policies.aligned import Aligned
-from tpgmm_evaluation.policies.elapsed_time import tell_time
 from tpgmm_evaluation.policies.episodes import Episodes
-from tpgmm_evaluation.policies.neighbours import NeighboursPolicy
 from tpgmm_evaluation.policies.planned import SituatedPolicy
-from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
 from tpgmm_evaluation.policies.replay import NearestPolicy
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 from tpgmm_evaluation.settings import Settings
@@ -36,9 +33,6 @@ __all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
 
 #: TP-GMM with one of its parts removed, or with its operators chosen by itself.
 ABLATIONS = ("tpgmm-places", "tpgmm-position-only", "tpgmm-no-joints", "tpgmm-auto")
-#: How nearest-neighbour regression is set; chosen as all recipes, on other seeds.
-NEIGHBOURS: dict[str, Any] = {"n_neighbours": 3, "environment_weight": 3.0, "n_action_steps": 8}
-NEIGHBOURS_RATE, TIME_WEIGHT = 10, 30.0
 
 
 def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
@@ -72,7 +66,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     )
     recipe = {
         "n_components": model.n_components,
-        "operators": [format_operator(one) for one in model.operators_],
+        "operators": list(map(format_operator, model.operators_)),
     }
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"
@@ -80,13 +74,14 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
 
 
 def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
-    """Operators of TP-GMM when one of its parts is removed.
+    """Choose the operators of TP-GMM when one of its parts is removed.
 
     Parameters
     ----------
     base : str
         ``"tpgmm"`` or an ablation.
     benchmark : Benchmark
+        The environment with its robot.
     """
     operators = benchmark.operators(
         orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
@@ -97,18 +92,18 @@ def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
     robot = benchmark.robot
     moved = robot.state(robot.lower.clamp(-1, 1)).jacobians.abs().sum((0, 1)) > 0
     free = [name for name, moves in zip(robot.joint_names, moved, strict=True) if not moves]
-    rest: list[Operator] = [one for one in operators if not isinstance(one, Canonical)]
+    rest: list[Operator] = [part for part in operators if not isinstance(part, Canonical)]
     return [*rest, Canonical(joints=tuple(free))] if free else rest
 
 
 def _environment_names(path: Path) -> list[str]:
-    """Which entry of the observation is what: operators may name objects in another order."""
+    """Name the entries of the observation: operators may have objects in another order."""
     columns = {column.key: column.names for column in describe_lerobot(path).columns}
     return list(columns[OBS_ENV_STATE] or ())
 
 
 def _at_first(demonstration: Demonstration) -> Demonstration:
-    """With all objects where they were at the beginning."""
+    """Put all objects where they were at the beginning."""
     frames = {
         name: frame[0] if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
@@ -132,25 +127,7 @@ def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
     return Training(policy, processors, kept.fps, outcome="kept as they are")
 
 
-def _neighbours(episodes: Path, settings: Settings, cell: Cell, timed: bool) -> Training:
-    """Keep all states; with the time, of episodes on a common clock."""
-    kept = Episodes.read(episodes / "training").first(cell.demonstrations)
-    options, n_timed = dict(NEIGHBOURS), 0
-    if timed:
-        if not settings.benchmark().synchronous:
-            [kept] = kept.on_common_clock()
-        before, kept = kept, kept.with_time()
-        n_timed = kept.columns[OBS_ENV_STATE].shape[1] - before.columns[OBS_ENV_STATE].shape[1]
-        options["time_weight"] = TIME_WEIGHT
-    policy = NeighboursPolicy.fit(kept, NEIGHBOURS_RATE, n_timed, **options)
-    processors = make_default_pre_post_processors(policy.config)
-    if timed:
-        tell_time(processors[0], NEIGHBOURS_RATE)
-    recipe = {"rate": NEIGHBOURS_RATE, "phase": timed, **options}
-    return Training(policy, processors, NEIGHBOURS_RATE, recipe, outcome="kept as they are")
-
-
-def _situated(
+def _fit_plan(
     episodes: Path, settings: Settings, cell: Cell, kind: type[SituatedPolicy], **options: Any
 ) -> Training:
     """Fit what plans in joints to the aligned references."""
@@ -168,13 +145,9 @@ def _situated(
 TRAININGS: dict[str, Callable[[Path, Settings, Cell], Training]] = {
     "tpgmm": _tpgmm,
     **dict.fromkeys(ABLATIONS, _tpgmm),
-    "key-poses": partial(_situated, kind=KeyPosesPolicy),
-    "key-poses-posture": partial(_situated, kind=KeyPosesPolicy, posture=True),
-    "dmp": partial(_situated, kind=DMPPolicy),
-    "promp": partial(_situated, kind=ProMPPolicy),
+    "key-poses": partial(_fit_plan, kind=KeyPosesPolicy),
+    "key-poses-posture": partial(_fit_plan, kind=KeyPosesPolicy, posture=True),
     **dict.fromkeys(RECIPES, _baseline),
-    "knn": partial(_neighbours, timed=False),
-    "knn-phase": partial(_neighbours, timed=True),
     "nearest": _nearest,
-    "mean": partial(_situated, kind=MeanPolicy),
+    "mean": partial(_fit_plan, kind=MeanPolicy),
 }

@@ -68,5 +68,5 @@ class Variant:
 
     @property
     def arguments(self) -> list[str]:
-        """As LeRobot's configurations take them on top of a file."""
+        """The settings as LeRobot's configurations take them on top of a file."""
         return [f"--{override}" for override in self.overrides]

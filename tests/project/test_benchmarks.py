@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.obstacle_scenes import KINDS, examined, summary
+from benchmarks.obstacle_scenes import KINDS, examine_scene, summarize
 from benchmarks.points import BLOCKS, Problem, motions
 from benchmarks.roofline import flops_of_iteration
-from benchmarks.rows import Asked, Omitted, Row, markdown
+from benchmarks.rows import Asked, Omitted, Row, format_table
 from benchmarks.settings import CASES, Settings
 from benchmarks.timing import in_turns, medians, per_iteration
 
@@ -74,10 +74,10 @@ def test_a_case_can_be_measured_alone_and_others_do_not_exist(tmp_path):
 )
 def test_rows_say_whether_a_figure_was_reached(asked, ours, reached):
     row = Row("work", "s", ours, "other", 10.0, asked)
-    assert row.reached is reached
+    assert row.is_reached is reached
     assert row.ratio == pytest.approx(10 / ours)
     mark = {None: "| |", True: "yes", False: "**no**"}[reached]
-    assert mark.replace(" ", "") in markdown([row.record()]).replace(" ", "")
+    assert mark.replace(" ", "") in format_table([row.record()]).replace(" ", "")
 
 
 def test_a_ratio_needs_a_competitor():
@@ -86,7 +86,7 @@ def test_a_ratio_needs_a_competitor():
 
 
 def test_what_was_left_out_is_said():
-    table = markdown([Omitted("this", "no such package").record()])
+    table = format_table([Omitted("this", "no such package").record()])
     assert "- not measured: this: no such package" in table
 
 
@@ -109,7 +109,7 @@ def test_measurements_take_turns():
 
 def test_the_same_mixture_is_where_all_libraries_start():
     problem = Problem.of(motions(2_600), 4)
-    points, means, covariances = problem.joined()
+    points, means, covariances = problem.join_blocks()
     assert points.shape == (2_600, sum(BLOCKS))
     assert means[:, :15] == pytest.approx(problem.means[0])
     assert covariances[:, 15:, 15:] == pytest.approx(problem.covariances[1])
@@ -119,7 +119,7 @@ def test_the_same_mixture_is_where_all_libraries_start():
 
 def test_shuffled_times_are_the_same_in_all_blocks():
     problem = Problem.of(motions(2_600), 4)
-    shuffled = problem.shuffled()
+    shuffled = problem.shuffle_times()
     assert (shuffled.points[:, 0] == shuffled.points[:, 15]).all()
     assert sorted(shuffled.points[:, 0]) == sorted(problem.points[:, 0])
     assert (shuffled.points[:, 1:15] == problem.points[:, 1:15]).all()
@@ -137,9 +137,11 @@ def test_sizes_and_rounds():
 
 
 def test_scenes_in_the_way_are_drawn_and_references_keep_clear_of_them():
-    found = [examined(number, 0.04) for number in (KINDS.index("ball"), KINDS.index("carried"))]
+    found = [
+        examine_scene(number, 0.04) for number in (KINDS.index("ball"), KINDS.index("carried"))
+    ]
     for one in found:
         assert one["bare_mm"] < 0 < one["kept_mm"]
         assert one["bounds"] <= 1 + 1e-6
         assert one["finished"] or one["reason"].startswith("blocked by ")
-    assert "2 without, 0 with" in "\n".join(summary(found))
+    assert "2 without, 0 with" in "\n".join(summarize(found))

@@ -104,7 +104,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "tpgmm_evaluation": (
         ("benchmarks", "policies", "processes", "variants"),
-        ("cells", "policy_classes"),
+        ("cells",),
         ("baselines", "rollouts", "settings"),
         ("trainings",),
         ("jobs",),

@@ -50,14 +50,14 @@ def motions():
 
 
 @pytest.fixture(scope="module")
-def recorded(folder, settings):
+def recording(folder, settings):
     return load_lerobot(
         folder / "episodes" / "s0" / "training", robot=settings.benchmark().robot
     )
 
 
-def test_episodes_hold_what_was_seen_of_the_objects(recorded, motions):
-    for seen, motion in zip(recorded, motions, strict=False):
+def test_episodes_hold_what_was_seen_of_the_objects(recording, motions):
+    for seen, motion in zip(recording, motions, strict=False):
         bottle, tray = seen.frame("bottle"), seen.frame("tray")
         wanted = motion.frame("bottle")
         for key in ("position", "orientation"):
@@ -78,13 +78,13 @@ def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
 def test_demonstrations_that_fail_are_not_learned_from(settings, tmp_path, monkeypatch):
     monkeypatch.setattr(CarryBenchmark, "POOL", 4)
     monkeypatch.setattr(CarryBenchmark, "RESERVED", 1)
-    follow = CarryBenchmark._follow
+    follow = CarryBenchmark.follow
 
     def failing(self, env, number, motion):
         measured, success = follow(self, env, number, motion)
         return measured, success and number not in (1, 4)  # one of each
 
-    monkeypatch.setattr(CarryBenchmark, "_follow", failing)
+    monkeypatch.setattr(CarryBenchmark, "follow", failing)
     benchmark, robot = settings.benchmark(), settings.benchmark().robot
     assert benchmark.record(tmp_path / "two", 2, 1, 0) == [True, False, True]
     for name, numbers in (("training", (0, 2)), ("validation", (3,))):
@@ -95,7 +95,7 @@ def test_demonstrations_that_fail_are_not_learned_from(settings, tmp_path, monke
     with pytest.raises(DataError, match="of 4 demonstrations of carry_and_put 3 succeed"):
         benchmark.record(tmp_path / "four", 4, 1, 0)
     jobs.record(tmp_path, settings, 2)
-    monkeypatch.setattr(CarryBenchmark, "_follow", None)
+    monkeypatch.setattr(CarryBenchmark, "follow", None)
     jobs.record(tmp_path, settings, 2)  # what is there is enough
     with pytest.raises(TypeError):
         jobs.record(tmp_path, settings, 3)

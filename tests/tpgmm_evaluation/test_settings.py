@@ -37,17 +37,17 @@ def test_each_seed_draws_demonstrations_unless_they_are_fixed(tmp_path):
 
 def test_conditions_become_options_of_the_environment():
     settings = Settings(options={"mode": "kinematic"})
-    assert settings.disturbed("nominal") == {"mode": "kinematic"}
-    both = settings.disturbed("pushes+noise")
+    assert settings.disturb("nominal") == {"mode": "kinematic"}
+    both = settings.disturb("pushes+noise")
     assert both == {"mode": "kinematic", "pushes": True, "noise": 1.0}
-    stopped = settings.disturbed("stopped-3+noise+live")
+    stopped = settings.disturb("stopped-3+noise+live")
     assert stopped == {"mode": "kinematic", "noise": 1.0, "condition": "stopped-3+live"}
     with pytest.raises(UnknownNameError, match=r"'rain' is not in the conditions .*stopped-3"):
-        settings.disturbed("rain")
+        settings.disturb("rain")
     with pytest.raises(DataError, match="names stopped twice"):
-        settings.disturbed("stopped-3+stopped-4")
+        settings.disturb("stopped-3+stopped-4")
     with pytest.raises(UnknownNameError, match="'live' is not in the conditions of aloha"):
-        Settings("aloha_state").disturbed("live")
+        Settings("aloha_state").disturb("live")
     with pytest.raises(UnknownNameError, match="environment 'moon'"):
         Settings("moon").benchmark()
 
@@ -56,5 +56,5 @@ def test_all_conditions_of_a_benchmark_can_be_made():
     for settings in (Settings(), Settings("aloha_state")):
         conditions = settings.benchmark().all_conditions
         assert conditions[0] == "nominal" and len(set(conditions)) == len(conditions)
-        made = [settings.disturbed(condition) for condition in conditions]
+        made = [settings.disturb(condition) for condition in conditions]
         assert all(made.count(options) == 1 for options in made)

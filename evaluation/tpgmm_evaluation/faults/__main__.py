@@ -13,51 +13,45 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from tpgmm_evaluation.faults.drawing import HALVES, Run
-from tpgmm_evaluation.faults.measures import Measures, false_status, measure, measured
+from tpgmm_evaluation.faults.measures import Measures, false_status, measure, measure_runs
 from tpgmm_evaluation.faults.runs import simulate
 from tpgmm_evaluation.faults.skills import ROBOTS
 
 __all__ = ["main"]
 
 
-def _most(values: Sequence[float]) -> float:
-    return max((value for value in values if not np.isnan(value)), default=np.nan)
-
-
 #: What is printed of a measure of several runs, and what of one run counts as bad.
-COLUMNS: Mapping[str, tuple[Callable[..., float], float]] = {
-    **dict.fromkeys(("position", "speed", "acceleration", "jerk"), (np.sum, 0)),
-    "step": (np.max, np.inf),
-    **dict.fromkeys(("infinite", "raised", "false", "open"), (np.sum, 0)),
-    "late": (_most, 1),
-    "gap": (_most, 0.05),
-    "runaway": (np.max, 0.05),
+COLUMNS: Mapping[str, tuple[str, float]] = {
+    **dict.fromkeys(("position", "speed", "acceleration", "jerk"), ("sum", 0)),
+    "step": ("max", np.inf),
+    **dict.fromkeys(("infinite", "raised", "false", "open"), ("sum", 0)),
+    "late": ("max", 1),
+    "gap": ("max", 0.05),
+    "runaway": ("max", 0.05),
 }
 
 
 def _table(found: Sequence[tuple[Run, Measures]]) -> str:
-    """A row for each kind of fault, and for all runs."""
-    rows = defaultdict(list)
-    for run, each in found:
-        for kind in sorted({fault.kind for fault in run.faults}) or ["no faults"]:
-            rows[kind].append(each)
+    """Tabulate measures in a row for each kind of fault, and for all runs."""
+    runs = pd.DataFrame([measures for _, measures in found])
+    kinds = [sorted({fault.kind for fault in run.faults}) or ["no faults"] for run, _ in found]
+    by_kind = runs.assign(kind=kinds).explode("kind").groupby("kind")
     lines = [f"{'':12}{'runs':>6}{'true %':>8}" + "".join(f"{name:>13}" for name in COLUMNS)]
-    for kind, several in [*sorted(rows.items()), ("all", [each for _, each in found])]:
-        ticks, false = (np.sum([each[name] for each in several]) for name in ("ticks", "false"))
-        cells = [f"{pick([m[n] for m in several]):13.4g}" for n, (pick, _) in COLUMNS.items()]
-        true = 100 - 100 * false / ticks
-        lines.append(f"{kind:12}{len(several):6}{true:8.2f}{''.join(cells)}")
+    for kind, rows in [*by_kind, ("all", runs)]:
+        cells = [f"{rows[name].agg(how):13.4g}" for name, (how, _) in COLUMNS.items()]
+        true = 100 - 100 * rows["false"].sum() / rows.ticks.sum()
+        lines.append(f"{kind:12}{len(rows):6}{true:8.2f}{''.join(cells)}")
     return "\n".join(lines)
 
 
 def _worst(found: Sequence[tuple[Run, Measures]]) -> str:
-    """Seeds of the worst runs of each measure."""
+    """List seeds of the worst runs of each measure."""
     lines = []
     for name, (_, most) in COLUMNS.items():
         worst = sorted(((m[name], run.seed) for run, m in found if m[name] > most))[::-1]
@@ -67,7 +61,7 @@ def _worst(found: Sequence[tuple[Run, Measures]]) -> str:
 
 
 def _show(run: Run) -> None:
-    """One run, every tenth of a second."""
+    """Print one run, every tenth of a second."""
     with warnings.catch_warnings(action="ignore"):
         [log] = simulate([run])
     ticks, wrong = log.ticks, false_status(log)
@@ -98,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     seeds = range(given.seed, given.seed + given.runs)
     runs = [Run.draw(given.half, seed, rates, robots) for seed in seeds]
-    found = measured(runs, given.workers)
+    found = measure_runs(runs, given.workers)
     print(_table(found), _worst(found), sep="\n")
 
 

@@ -27,6 +27,7 @@ class Fault:
     Parameters
     ----------
     kind : str
+        Key of ``KINDS``.
     begin, end : float
         Since the start of the run [s].
     joints : ndarray of shape (n_joints,)
@@ -49,17 +50,17 @@ class Fault:
         return f"{self.kind} {self.size:.3g} of {joints}, {self.begin:.2f} to {self.end:.2f} s"
 
     def active(self, time: Array | float) -> NDArray[np.bool_]:
-        """Whether it lasts at these times."""
+        """Return whether it lasts at these times."""
         return (time >= np.array(self.begin)) & (time < np.array(self.end))
 
 
-def _frozen(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
+def _freeze(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
     if fault.kept is None:
         fault.kept = reading
     return fault.kept
 
 
-def _swapped(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
+def _swap(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
     order, concerned = np.arange(len(reading)), np.flatnonzero(fault.joints)
     order[concerned] = np.roll(concerned, 1)
     return reading[order]
@@ -71,9 +72,9 @@ READINGS: Mapping[str, Callable[[Array, Fault, Array, np.random.Generator], Arra
     "noise": lambda y, fault, last, rng: y + fault.size * rng.standard_normal(len(y)),
     "dropped": lambda y, fault, last, rng: np.full_like(y, np.nan),
     "repeated": lambda y, fault, last, rng: last if rng.random() < fault.size else y,
-    "frozen": _frozen,
+    "frozen": _freeze,
     "zeros": lambda y, fault, last, rng: np.zeros_like(y),
-    "swapped": _swapped,
+    "swapped": _swap,
     "units": lambda y, fault, last, rng: np.rad2deg(y) if fault.size > 0 else np.deg2rad(y),
     "flipped": lambda y, fault, last, rng: np.where(fault.joints != 0, -y, y),
     "outliers": lambda y, fault, last, rng: (
@@ -123,15 +124,19 @@ class Run:
     Parameters
     ----------
     robot : str
+        Key of :data:`~tpgmm_evaluation.faults.skills.ROBOTS`.
     rate : float
         [Hz].
     servo : Servo
+        Of all joints.
     faults : sequence of Fault
+        In the order in which they have an effect.
     number : int
         Of the situation.
     rng : numpy.random.Generator
         Of noise.
     seed : int
+        With which it was drawn.
     true, given : ndarray of shape (n_ticks,)
         Durations that pass, and that the controller is given [s].
     """
@@ -167,7 +172,7 @@ class Run:
 
     @property
     def situation(self) -> Scenario:
-        """Where it begins."""
+        """The situation in which it begins."""
         return situations(self.robot)[self.number]
 
     def __str__(self) -> str:
@@ -180,7 +185,7 @@ class Run:
     def draw(
         cls, half: str, seed: int, rates: Sequence[float], robots: Sequence[str] = tuple(ROBOTS)
     ) -> Run:
-        """The run of a seed of one half."""
+        """Draw the run of a seed of one half."""
         rng = np.random.default_rng((HALVES.index(half), seed))
         robot, rate = str(rng.choice(robots)), float(rng.choice(rates))
         number = int(rng.integers(len(situations(robot))))
@@ -188,12 +193,12 @@ class Run:
         servo = Servo.draw(rng, situation.limits[2])
         faults = [_draw(rng, situation) for _ in range(rng.choice([0, 1, 1, 1, 2, 3]))]
         # offsets and noise before what replaces readings
-        faults.sort(key=lambda one: (list(KINDS).index(one.kind), one.begin))
+        faults.sort(key=lambda fault: (list(KINDS).index(fault.kind), fault.begin))
         return cls(robot, rate, servo, faults, number, rng, seed)
 
 
 def _draw(rng: np.random.Generator, situation: Scenario) -> Fault:
-    """Any fault, some time in the skill."""
+    """Draw any fault, some time in the skill."""
     kind, n = str(rng.choice(list(KINDS))), len(situation.joints)
     least, most, longest, share = KINDS[kind]
     begin, lasting = rng.uniform(0.2, situation.skill.end), rng.uniform(0.05, min(longest, 3.0))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
 from tpgmm_evaluation.faults.runs import Log, Tick, simulate
 
-__all__ = ["Measures", "false_status", "measure", "measured"]
+__all__ = ["Measures", "false_status", "measure", "measure_runs"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,19 +27,19 @@ ROOM = 1.01
 TOGETHER = 16
 
 
-def measured(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
-    """Measures of runs."""
+def measure_runs(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
+    """Simulate runs in so many processes, and measure them."""
     groups = defaultdict(list)
     for run in runs:
         groups[run.robot, run.rate].append(run)
     parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
     if workers == 1:
-        return [one for part in parts for one in _measured(part)]
+        return [found for part in parts for found in _measure_part(part)]
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        return [one for part in pool.map(_measured, parts) for one in part]
+        return [found for part in pool.map(_measure_part, parts) for found in part]
 
 
-def _measured(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
+def _measure_part(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
     torch.set_num_threads(1)
     with warnings.catch_warnings(action="ignore"):
         return [(log.run, measure(log)) for log in simulate(runs)]
@@ -81,7 +81,7 @@ def measure(log: Log) -> Measures:
 
 
 def _rates(ticks: Tick, start: Array, limits: tuple[Array, ...]) -> list[Array]:
-    """Speed, acceleration and jerk of each tick, in units of their limits, from rest."""
+    """Compute speed, acceleration and jerk of each tick, in units of their limits."""
     timed = ticks.given > 0  # false where it is not a number
     reference = np.concatenate((start[None], ticks.reference))
     jumped = (np.diff(reference, axis=0)[~timed] != 0).any(-1)  # in no time
@@ -100,12 +100,12 @@ def _rates(ticks: Tick, start: Array, limits: tuple[Array, ...]) -> list[Array]:
 
 
 def _lasting(mask: Mask, time: Array) -> Array:
-    """For how long something has been so at each tick [s]; 0 where it is not."""
+    """Compute for how long something has been so at each tick [s]; 0 where it is not."""
     return time - np.maximum.accumulate(np.where(mask, 0.0, time))
 
 
 def _readings(log: Log, ticks: Tick) -> tuple[Mask, Mask]:
-    """Ticks with readings that cannot be right, and those with readings that are off at all."""
+    """Find ticks with readings that cannot be right, and with readings that are off."""
     off = np.abs(ticks.reading - ticks.expected)
     lost = np.isnan(off).any(-1)
     off = np.nan_to_num(off).max(-1)
@@ -121,7 +121,7 @@ def _readings(log: Log, ticks: Tick) -> tuple[Mask, Mask]:
 
 
 def false_status(log: Log) -> Mask:
-    """Ticks with a status that is not so.
+    """Find ticks with a status that is not so.
 
     A robot has to *hold* while readings are impossible for more than 0.3 s; to *wait* (or be
     *displaced*) while it is away from where its servos would be if nothing had disturbed them,
@@ -157,12 +157,12 @@ def false_status(log: Log) -> Mask:
 
 
 def _arm(log: Log) -> Mask:
-    """Joints that are waited for: no gripper, which closes on something."""
+    """Find joints that are waited for: no gripper, which closes on something."""
     return np.array(log.run.situation.skill.kinematics.joint_names) != "gripper"
 
 
 def _offset(log: Log, ticks: Tick) -> Array:
-    """Of readings and load (n_ticks, n_joints)."""
+    """Compute the offset of readings and load (n_ticks, n_joints)."""
     offset = ticks.load
     for fault in log.run.faults:
         if fault.kind == "offset":

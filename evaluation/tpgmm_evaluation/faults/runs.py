@@ -49,6 +49,7 @@ class Log:
     Parameters
     ----------
     run : Run
+        As it was drawn.
     done : float
         When it finished [s].
     error : str
@@ -75,12 +76,16 @@ class Log:
 
     @property
     def ticks(self) -> Tick:
-        """Arrays of shape (n_ticks, ...)."""
+        """All ticks as arrays of shape (n_ticks, ...)."""
         return Tick(*(np.array(column) for column in zip(*self.rows, strict=True)))
 
+    def is_over(self, now: float) -> bool:
+        """Return whether nothing happens any more."""
+        return bool(self.error) or now > self.done + AFTER_END
+
     def step(self, given: float, now: float, joints: Array, load: Array) -> None:
-        """The next reference; nothing happens after the end."""
-        if self.error or now > self.done + AFTER_END:
+        """Take the next reference; nothing happens after the end."""
+        if self.is_over(now):
             return
         expected, self.reading = _read(self.run, joints[0], self.reading, now)
         try:
@@ -113,15 +118,15 @@ def simulate(runs: Sequence[Run]) -> list[Log]:
         now = now + dt
         load = _disturb(runs, now, servos, dt)
         for i, log in enumerate(logs):
-            log.step(runs[i].given[k], now[i], servos.joints[:, i], load[i])
-        if all(log.error or now[i] > log.done + AFTER_END for i, log in enumerate(logs)):
+            log.step(log.run.given[k], now[i], servos.joints[:, i], load[i])
+        if all(log.is_over(at) for log, at in zip(logs, now, strict=True)):
             break
         servos.send(np.array([log.reference for log in logs]))
     return logs
 
 
 def _read(run: Run, joints: Array, last: Array, now: float) -> tuple[Array, Array]:
-    """Readings with an offset and noise at most, and with all faults."""
+    """Read joints with an offset and noise at most, and with all faults."""
     step = run.servo.resolution
     expected = reading = np.round(joints / step) * step
     for fault in run.faults:
@@ -132,7 +137,7 @@ def _read(run: Run, joints: Array, last: Array, now: float) -> tuple[Array, Arra
 
 
 def _seen(run: Run, now: float) -> Mapping[str, Array] | None:
-    """Poses of the objects, where a camera sees them."""
+    """Return poses of the objects, where a camera sees them."""
     faults = [fault for fault in run.faults if fault.kind in POSES]
     if not faults:
         return None
@@ -146,7 +151,7 @@ def _seen(run: Run, now: float) -> Mapping[str, Array] | None:
 
 
 def _disturb(runs: Sequence[Run], now: Array, servos: Servos, dt: Array) -> Array:
-    """Servos go on for a tick, disturbed by somebody; the loads."""
+    """Advance the servos by a tick, disturbed by somebody; return the loads."""
     shape = servos.joints.shape[1:]
     held, load = np.zeros(shape, dtype=bool), np.zeros(shape)
     walls = np.stack((np.full(shape, -np.inf), np.full(shape, np.inf)))
@@ -159,14 +164,14 @@ def _disturb(runs: Sequence[Run], now: Array, servos: Servos, dt: Array) -> Arra
             elif fault.kind in ("contact", "grasp") and fault.active(now[i]):
                 _block(run, fault, walls[:, i])
             elif fault.kind in ("push", "teleport") and fault.active(now[i]):
-                servos.place(i, _moved(run, fault, servos.joints[0, i], now[i]))
+                servos.place(i, _carry(run, fault, servos.joints[0, i], now[i]))
                 held[i] = True
     servos.advance(dt, held, load, walls)
     return load
 
 
 def _block(run: Run, fault: Fault, walls: Array) -> None:
-    """A wall stands before where a joint would come to in the meantime."""
+    """Put a wall before where a joint would come to in the meantime."""
     [joint] = np.flatnonzero(fault.joints)
     part = run.situation.path[:, joint]
     part = part[int(fault.begin * PATH_RATE) : int(min(fault.end, 100) * PATH_RATE)]
@@ -176,8 +181,8 @@ def _block(run: Run, fault: Fault, walls: Array) -> None:
         walls[0, joint] = part.min() + fault.size
 
 
-def _moved(run: Run, fault: Fault, joints: Array, now: float) -> Array:
-    """Where somebody carries a robot: at once to anywhere, or along its way."""
+def _carry(run: Run, fault: Fault, joints: Array, now: float) -> Array:
+    """Carry a robot: at once to anywhere, or along its way."""
     path = run.situation.path
     if fault.kept is None:
         fault.kept = joints

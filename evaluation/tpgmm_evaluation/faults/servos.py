@@ -53,11 +53,11 @@ class Servo:
 
     @classmethod
     def draw(cls, rng: np.random.Generator, fastest: Array) -> Self:
-        """Any servo, for joints with these limits of speed."""
+        """Draw any servo, for joints with these limits of speed."""
         n = len(fastest)
 
         def some(share: float, most: float) -> Array:
-            """Zero, but for a share of the robots; there, up to a bound in each joint."""
+            """Draw zero, but for a share of the robots up to a bound in each joint."""
             return (rng.random() < share) * rng.uniform(0, most) * rng.uniform(0, 1, n)
 
         usual = np.exp(rng.uniform(np.log(0.02), np.log(0.4)))
@@ -79,6 +79,7 @@ class Servos:
     Parameters
     ----------
     servos : sequence of Servo
+        Of each robot.
     joints : ndarray of shape (n_robots, n_joints)
         Where they begin, which is the first reference.
     limits : tuple of two ndarray of shape (n_joints,)
@@ -96,8 +97,8 @@ class Servos:
         self, servos: Sequence[Servo], joints: Array, limits: tuple[Array, ...], most: int
     ) -> None:
         names = ("lag", "damping", "speed", "stiction", "backlash", "sag")
-        each = [[getattr(s, name) + np.zeros(len(joints[0])) for s in servos] for name in names]
-        lag, damping, self._fastest, self._friction, backlash, self._sag = map(np.array, each)
+        values = [[getattr(s, n) + np.zeros(len(joints[0])) for s in servos] for n in names]
+        lag, damping, self._fastest, self._friction, backlash, self._sag = map(np.array, values)
         self._stiffness, self._play = (2 * damping / lag) ** 2, backlash / 2
         self._damping = 4 * damping**2 / lag
         self._delay, self._limits = np.array([servo.delay for servo in servos]), limits
@@ -110,21 +111,22 @@ class Servos:
         self._references[0], self._effective = joints, self._robots * 0
 
     def send(self, references: Array) -> None:
-        """New references from now on."""
+        """Send new references."""
         self._last += 1
         self._sent[self._last], self._references[self._last] = self._now, references
 
     def place(self, robot: int, joints: Array) -> None:
-        """A robot stands somewhere else; its shadow does not."""
+        """Put a robot somewhere else; its shadow stays."""
         self._motor[0, robot] = self.joints[0, robot] = joints
         self._speed[0, robot] = 0
 
     def advance(self, dt: Array, held: NDArray[np.bool_], load: Array, walls: Array) -> None:
-        """Some time passes for each robot.
+        """Let some time pass for each robot.
 
         Parameters
         ----------
         dt : ndarray of shape (n_robots,)
+            How much [s].
         held : ndarray of bool of shape (n_robots, n_joints)
             Joints that somebody holds.
         load : ndarray of shape (n_robots, n_joints)
@@ -142,21 +144,21 @@ class Servos:
         for _ in range(steps):
             self._now = self._now + h[:, 0]
             gap = self._effective_references() - self._sag - load - self._motor
-            self._speed = free * self._accelerated(gap, h)
+            self._speed = free * self._accelerate(gap, h)
             moved = self._motor + h * self._speed
             self._motor = moved.clip(low, high)
             self._speed = self._speed * (moved == self._motor)
             self.joints = self.joints.clip(self._motor - self._play, self._motor + self._play)
 
     def _effective_references(self) -> Array:
-        """The last ones that were sent the delay ago."""
+        """Return the last references that were sent the delay ago."""
         latest = self._now - self._delay + 1e-9
         while (due := self._sent[self._effective + 1, self._robots] <= latest).any():
             self._effective = self._effective + due
         return self._references[self._effective, self._robots]
 
-    def _accelerated(self, gap: Array, h: Array) -> Array:
-        """Speeds after a step, implicitly, so that no step is too long."""
+    def _accelerate(self, gap: Array, h: Array) -> Array:
+        """Compute speeds after a step, implicitly, so that no step is too long."""
         friction, speed = self._friction, self._speed
         stands = np.abs(speed) <= STANDING
         way = np.sign(np.where(stands, gap, speed))

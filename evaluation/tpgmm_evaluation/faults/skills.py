@@ -33,8 +33,11 @@ class Scenario:
     Parameters
     ----------
     skill : Skill
+        What is played.
     joints : ndarray of shape (n_joints,)
+        Where the robot begins.
     frames : mapping of str to Frame
+        Poses of the objects.
     path : ndarray of shape (n_ticks, n_joints)
         Undisturbed references at 50 Hz.
     """
@@ -46,7 +49,7 @@ class Scenario:
 
     @property
     def limits(self) -> tuple[Array, ...]:
-        """Of lower and upper positions, speed, acceleration and jerk, each (n_joints,)."""
+        """Limits of lower and upper positions, speed, acceleration and jerk, (n_joints,)."""
         bounds = self.skill.motion_bounds
         assert bounds is not None
         names = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -54,13 +57,13 @@ class Scenario:
 
 
 def _rise(share: Any) -> Any:
-    """Minimum jerk from 0 to 1, as a column."""
+    """Rise from 0 to 1 at minimum jerk, as a column."""
     u = np.clip(share, 0, 1)
     return (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
 
 
 def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstration]]:
-    """Joints about these axes reach a cup, rest while a gripper closes, and leave it."""
+    """Let joints about these axes reach a cup, rest while a gripper closes, and leave."""
     text = ['<robot name="arm"><link name="base"/>']
     links = ["base", *range(1, len(axes)), "hand"]
     for number, axis in enumerate(axes, 1):
@@ -94,7 +97,7 @@ def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstratio
 
 
 def _upper_body() -> tuple[Model, Sequence[Demonstration]]:
-    """The paper's skill, of four demonstrations."""
+    """Learn the paper's skill from four demonstrations."""
     robot = Robot.from_urdf(upper_body_urdf(), links=("l_hand", "r_hand"))
     recorded = BottleShaking(rate=10, robot=robot).demonstrations(4, seed=0)
     shown = DynamicTimeWarping(robot=robot).fit_transform(recorded)
@@ -111,13 +114,14 @@ ROBOTS: Mapping[str, Callable[[], tuple[Model, Sequence[Demonstration]]]] = {
 
 @cache
 def situations(robot: str) -> Sequence[Scenario]:
-    """Those of the demonstrations of one of the robots."""
+    """Return the situations of the demonstrations of a robot, with undisturbed paths."""
     (model, shown), found = ROBOTS[robot](), []
     skill = model.skill
-    for one in shown:
-        start, path = one.joints[0], [one.joints[0]]
-        controller = Controller(skill, start, one.frames)
+    for demonstration in shown:
+        start, path = demonstration.joints[0], [demonstration.joints[0]]
+        controller = Controller(skill, start, demonstration.frames)
         for _ in range(round(skill.end * PATH_RATE)):
             path.append(controller.step(1 / PATH_RATE).reference)
-        found.append(Scenario(skill, start.numpy(), one.frames, torch.stack(path).numpy()))
+        frames = demonstration.frames
+        found.append(Scenario(skill, start.numpy(), frames, torch.stack(path).numpy()))
     return found

@@ -6,11 +6,11 @@ one with more episodes adds those that are new.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ import typer
 
 from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from lerobot_env_bimanual.metaworld.tasks import TASKS, check_task
-from tpgmm_evaluation.cells import Cell, Results
-from tpgmm_evaluation.metaworld.learners import LEARNERS, Actor, Learner
+from tpgmm_evaluation.cells import Cell, Results, parse_numbers
+from tpgmm_evaluation.metaworld.learners import LEARNERS, Actor, Learner, settings_of
 from tpgmm_evaluation.metaworld.networks import Network
 from tpgmm_evaluation.metaworld.recordings import (
     evaluation_seeds,
-    recorded,
+    record_expert,
     successes,
     validation,
 )
@@ -35,11 +35,11 @@ from tpgmm_evaluation.metaworld.summary import (
     summary,
     task_table,
 )
-from tpgmm_evaluation.metaworld.trials import trials
+from tpgmm_evaluation.metaworld.trials import try_out
 from tpgmm_evaluation.report.pages import write_page
 from tpgmm_evaluation.report.tables import episode_table, write_table
 from tpgmm_tools.arguments import options
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["app"]
 
@@ -87,31 +87,24 @@ def run(
     """
     torch.set_num_threads(1)
     names = TASKS if tasks == "all" else [check_task(name) for name in tasks.split(",")]
-    chosen = policies.split(",")
-    for name in chosen:
-        if name not in LEARNERS:
-            raise UnknownNameError("policy", name, "the benchmark", LEARNERS)
-    learners = {name: _limited(LEARNERS[name], 60 * budget) for name in chosen}
+    learners = _choose_learners(policies.split(","), 60 * budget)
     results = Results(out / ("tuning" if tuning else "cells"))
     situations = evaluation_seeds(episodes, tuning=tuning)
+    counts = parse_numbers(demonstrations, "--demonstrations")
+    grid = list(product(parse_numbers(seeds, "--seeds"), counts))
     for task in names:
-        cells = [
-            Cell(task, policy, n, seed)
-            for seed in _integers("seeds", seeds)
-            for n in _integers("demonstrations", demonstrations)
-            for policy in chosen
-        ]
-        kept = {
-            cell: _kept(results, cell, settings_of(learners[cell.policy]), situations)
-            for cell in cells
-        }
-        missing = [cell for cell in cells if len(kept[cell]) < episodes]
+        missing = {}
+        for (seed, n), policy in product(grid, learners):
+            cell = Cell(task, policy, n, seed)
+            done = _read_episodes(results, cell, settings_of(learners[policy]), situations)
+            if len(done) < episodes:
+                missing[cell] = done
         if not missing:
             continue
         env = MetaworldStateEnv(task)
-        for cell in missing:
+        for cell, done in missing.items():
             learner, folder = learners[cell.policy], out / "demonstrations"
-            result = _measure(env, cell, learner, folder, record, situations, kept[cell])
+            result = _measure(env, cell, learner, folder, record, situations, done)
             results.write(cell, result)
             solved = sum(episode["success"] for episode in result["episodes"])
             typer.echo(f"{cell.key}: {solved} of {episodes}")
@@ -119,27 +112,23 @@ def run(
     report(results, out)
 
 
-def _integers(option: str, text: str) -> list[int]:
-    try:
-        return [int(number) for number in text.split(",")]
-    except ValueError:
-        raise DataError(f"--{option} is integers joined by commas, got {text!r}") from None
+def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
+    """Select learners by their names, networks with a budget [s]."""
+    learners: dict[str, Learner] = {}
+    for name in names:
+        if name not in LEARNERS:
+            raise UnknownNameError("policy", name, "the benchmark", LEARNERS)
+        learner = LEARNERS[name]
+        if isinstance(learner, Network):
+            learner = replace(learner, budget=budget)
+        learners[name] = learner
+    return learners
 
 
-def _limited(learner: Learner, budget: float) -> Learner:
-    return replace(learner, budget=budget) if isinstance(learner, Network) else learner
-
-
-def settings_of(learner: Learner) -> dict[str, Any]:
-    """All settings of a learner, as JSON holds them."""
-    text = json.dumps(asdict(learner), default=lambda kind: kind.__name__)
-    return dict(json.loads(text))
-
-
-def _kept(
+def _read_episodes(
     results: Results, cell: Cell, settings: dict[str, Any], situations: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Episodes of a cell in the first of these situations, if settings are as they were."""
+    """Read episodes of a cell in the first of these situations, of the same settings."""
     found = results.read(cell)
     if found is None or found["settings"] != settings:
         return []
@@ -155,9 +144,9 @@ def _measure(
     folder: Path,
     record: int,
     situations: Sequence[int],
-    kept: list[dict[str, Any]],
+    done: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    shown = recorded(folder, cell.env, cell.seed, cell.demonstrations, record)
+    shown = record_expert(folder, cell.env, cell.seed, cell.demonstrations, record)
     chosen = successes(shown, cell.demonstrations, cell.env)
     held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
     began = time.process_time()
@@ -167,13 +156,13 @@ def _measure(
         else learner.fit(chosen, cell.seed)
     )
     trained = time.process_time()
-    episodes = [*kept, *trials(env, actor, situations[len(kept) :])]
+    episodes = [*done, *try_out(env, actor, situations[len(done) :])]
     return {
         "episodes": episodes,
         "settings": settings_of(learner),
-        "expert": {"episodes": len(shown), "successes": sum(one.success for one in shown)},
-        "demonstration_seeds": [one.seed for one in chosen],
-        "validation_seeds": [one.seed for one in held_out],
+        "expert": {"episodes": len(shown), "successes": sum(e.success for e in shown)},
+        "demonstration_seeds": [episode.seed for episode in chosen],
+        "validation_seeds": [episode.seed for episode in held_out],
         "training_seconds": trained - began,  # of the processor
         "training_outcome": actor.outcome,
         "evaluation_seconds": time.process_time() - trained,
@@ -186,27 +175,26 @@ def report(results: Results, out: Path) -> None:
     found = results.read_all(typer.echo)
     if not found:
         return
-    experts = {(one["cell"]["env"], one["cell"]["seed"]): one["expert"] for one in found}
+    experts = {(cell["cell"]["env"], cell["cell"]["seed"]): cell["expert"] for cell in found}
     asked, solved = (
         sum(expert[key] for expert in experts.values()) for key in ("episodes", "successes")
     )
-    # its demonstrations are those of the training seed
-    shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
-    rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
-    episodes = episode_table(rows)
-    successes_by_group = summary(found)
+    for cell in found:  # its demonstrations are those of the training seed
+        cell["settings"]["demonstration_seed"] = cell["cell"]["seed"]
+    episodes = episode_table(found)
+    successes_by_group = summary(episodes)
     paragraphs = (
         "# Meta-World: successes in per cent",
         f"The scripted experts solved {solved} of {asked} situations.",
         successes_by_group,
         "![Success over demonstrations, a panel for each group of tasks](success.webp)",
         comparison_table(episodes),
-        task_table(found),
+        task_table(episodes),
         cost_table(found),
     )
     draw_groups(episodes, out / "success")
     write_table(episodes, out / "episodes")
-    write_page(out / "results.md", filter(None, paragraphs))
+    write_page(out / "results.md", "\n\n".join(filter(None, paragraphs)))
     typer.echo(successes_by_group)
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,7 +31,7 @@ from tpgmm_torch.skills.sequence import Sequence as SkillSequence
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.training.hold_detection import with_holds
 
-__all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "switches"]
+__all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "settings_of", "switches"]
 
 Rows = NDArray[np.float64]
 #: A change of the wanted opening by more than this, in a step, is a gripper that switches.
@@ -61,17 +62,17 @@ class Actor(Protocol):
         """Take the first observations (B, 25) of the episodes to come, in their order."""
 
     def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The action (4,) after an observation (25,)."""
+        """Return the action (4,) after an observation (25,)."""
 
 
 def switches(references: Rows) -> list[int]:
-    """The steps at which the wanted opening, the last column of references, jumps."""
+    """Find the steps at which the wanted opening, the last column of references, jumps."""
     jumps = np.abs(np.diff(references[:, -1])) > SWITCH
     return [int(i) + 1 for i in np.flatnonzero(jumps)]
 
 
 def apart(references: Rows) -> list[int]:
-    """The switches that are ``APART`` from the one before, the beginning and the end."""
+    """Find switches that are ``APART`` from the one before, the beginning and the end."""
     kept = [0]
     for step in switches(references):
         if step - kept[-1] >= APART and step + APART <= len(references):
@@ -79,42 +80,42 @@ def apart(references: Rows) -> list[int]:
     return kept[1:]
 
 
-def direct(episodes: Sequence[Recorded], longest: float) -> list[Recorded]:
-    """Those that take no more than ``longest`` times the shortest of them.
+def drop_slow(episodes: Sequence[Recorded], longest: float) -> list[Recorded]:
+    """Drop episodes that take more than ``longest`` times the shortest of them.
 
     Experts try again where they missed, and that takes time. A mean over episodes in which
     the hand comes once and in which it comes twice comes neither once nor twice.
     """
-    shortest = min(len(one.references) for one in episodes)
-    return [one for one in episodes if len(one.references) <= longest * shortest]
+    shortest = min(len(episode.references) for episode in episodes)
+    return [shown for shown in episodes if len(shown.references) <= longest * shortest]
 
 
-def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
-    """Demonstrations at ``pace`` of their speed; the switches that all of them have are events.
+def slow_down(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
+    """Slow demonstrations down to ``pace`` of their speed; common switches are events.
 
     Fingers do not slow down with the hand. Their commands come later, so that they have
     closed where the experts' had. Switches count from the first: some experts take a
     second grip, and others do not need it.
     """
     later = round(CLOSING * (1 - pace) * FPS)
-    episodes = [_closing_later(episode, later) for episode in episodes]
+    episodes = [_delay_gripper(episode, later) for episode in episodes]
     demonstrations = [episode.demonstration() for episode in episodes]
-    found = [apart(one.references) for one in episodes]
+    found = [apart(episode.references) for episode in episodes]
     return [
         replace(
-            one,
-            time=one.time / pace,
+            shown,
+            time=shown.time / pace,
             events={
                 f"switch {i + 1}": step / FPS / pace
                 for i, step in enumerate(steps[: min(map(len, found))])
             },
         )
-        for one, steps in zip(demonstrations, found, strict=True)
+        for shown, steps in zip(demonstrations, found, strict=True)
     ]
 
 
-def _closing_later(episode: Recorded, later: int) -> Recorded:
-    """The same, with the wanted opening some steps later."""
+def _delay_gripper(episode: Recorded, later: int) -> Recorded:
+    """Delay the wanted opening by some steps."""
     references = episode.references.copy()
     steps = np.arange(len(references))
     references[:, -1] = references[np.maximum(steps - later, 0), -1]
@@ -122,8 +123,8 @@ def _closing_later(episode: Recorded, later: int) -> Recorded:
 
 
 def present(episodes: Sequence[Recorded]) -> list[str]:
-    """The frames that are somewhere: Meta-World puts objects that are not at the origin."""
-    poses = np.stack([one.observed[0, len(JOINTS) :].reshape(-1, 7) for one in episodes])
+    """Find the frames that exist: Meta-World puts objects that do not at the origin."""
+    poses = np.stack([shown.observed[0, len(JOINTS) :].reshape(-1, 7) for shown in episodes])
     there = np.abs(poses[..., :3]).max((0, 2)) > ABSENT
     return [name for name, is_there in zip(FRAMES, there, strict=True) if is_there]
 
@@ -143,6 +144,7 @@ class TaskParameterized:
     steps_per_component : int
         How much of the skill one Gaussian is for, of at least ``fewest``.
     fewest : int
+        Gaussians at least.
     warping : dict
         Of :class:`~tpgmm_torch.alignment.DynamicTimeWarping`, between switches of the gripper:
         its defaults are for motions of several seconds, these last about one. The default
@@ -179,8 +181,8 @@ class TaskParameterized:
         robot = metaworld_robot()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            learned = direct(episodes, self.longest)
-            demonstrations = self._aligned(paced(learned, self.pace), robot)
+            learned = drop_slow(episodes, self.longest)
+            demonstrations = self.align(slow_down(learned, self.pace), robot)
             n_steps = len(demonstrations[0])
             model = TaskParameterizedGMM(
                 max(self.fewest, n_steps // self.steps_per_component),
@@ -192,7 +194,7 @@ class TaskParameterized:
             # a gripper that closes is a step, which Gaussians across it would smear
             parts: Any = fit_parts(model, shown, cuts).skills
         if self.nearness is not None:
-            parts = tuple(self.nearness.applied(one, len(learned)) for one in parts)
+            parts = tuple(self.nearness.apply(part, len(learned)) for part in parts)
         skill = SkillSequence(parts, fade=1.5 / FPS / self.pace)  # parts are a step apart
         frames = {
             name: list(range(7 * i, 7 * i + 7))
@@ -218,7 +220,8 @@ class TaskParameterized:
         )
         return TaskParameterizedActor(policy, self.clock is None)
 
-    def _aligned(self, demonstrations: list[Demonstration], robot: Any) -> list[Demonstration]:
+    def align(self, demonstrations: list[Demonstration], robot: Any) -> list[Demonstration]:
+        """Align demonstrations in time, between the switches that they have in common."""
         if len(demonstrations) == 1:
             return demonstrations
         warping = DynamicTimeWarping(robot=robot, **self.warping)
@@ -234,6 +237,7 @@ class TaskParameterizedActor:
     Parameters
     ----------
     policy : TPGMMPolicy
+        As learned from the demonstrations.
     chunked : bool
         Whether it says all actions of an episode from the first observation.
     """
@@ -252,7 +256,7 @@ class TaskParameterizedActor:
             self._plan = self.policy.predict_action_chunk(_batch(first)).numpy()
 
     def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The next reference."""
+        """Return the next reference."""
         if self.chunked:
             plan = self._plan[episode]
             return np.asarray(plan[min(step, len(plan) - 1)])
@@ -271,3 +275,9 @@ Learner = TaskParameterized | Perceptron | Network
 LEARNERS: dict[str, Learner] = {
     learner.name: learner for learner in (TaskParameterized(), Perceptron(), *NETWORKS)
 }
+
+
+def settings_of(learner: Learner) -> dict[str, Any]:
+    """Return all settings of a learner, as JSON holds them."""
+    text = json.dumps(asdict(learner), default=lambda kind: kind.__name__)
+    return dict(json.loads(text))

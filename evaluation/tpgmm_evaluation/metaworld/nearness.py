@@ -58,11 +58,11 @@ class Nearness:
             )
 
     def deviation(self, distance: Tensor) -> Tensor:
-        """The prior's standard deviation [m] at distances [m]."""
+        """Compute the prior's standard deviation [m] at distances [m]."""
         return self.floor + self.ratio * self.reach * (distance / self.reach) ** self.power
 
-    def applied(self, skill: Regression, n_demonstrations: int) -> Regression:
-        """A skill under the prior; its operators are ``Canonical`` and relative positions.
+    def apply(self, skill: Regression, n_demonstrations: int) -> Regression:
+        """Apply the prior to a skill with ``Canonical`` and relative positions as operators.
 
         Coordinates of ``Canonical`` that are no lengths keep their variance, and lose their
         covariance with those that are: a gripper does not close because a hand is elsewhere.

@@ -76,17 +76,17 @@ class PerceptronActor:
         self.settings, self.pipeline = settings, pipeline
 
     def begin(self, first: Rows) -> None:
-        """Nothing: it looks at the present alone."""
+        """Do nothing: it looks at the present alone."""
 
     def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The next displacement and effort."""
+        """Return the next displacement and effort."""
         x = features(observed[None], relative=self.settings.relative)
         action = self.pipeline.predict(x)[0]
         return np.clip(action, -1.0, 1.0)
 
 
 def features(observed: Rows, *, relative: bool) -> Rows:
-    """Inputs of a network (T, n) from observations (T, 25): the hand, and where objects are.
+    """Compute inputs of a network (T, n) from observations (T, 25): the hand and the objects.
 
     With ``relative``, also the places of the objects as seen from the hand.
     """
@@ -135,15 +135,15 @@ class Network:
         return NetworkActor(self, result)
 
     def observation(self, observed: Rows) -> tuple[torch.Tensor, torch.Tensor]:
-        """State (T, 4) and environment state (T, n) of observations (T, 25)."""
+        """Split observations (T, 25) into state (T, 4) and environment state (T, n)."""
         rows = torch.from_numpy(features(observed, relative=True)).float()
         return rows[:, : len(JOINTS)], rows[:, len(JOINTS) :]
 
     def _rows(self, episodes: Sequence[Recorded]) -> Episodes:
         parts = []
-        for one in episodes:
-            actions = one.references if self.control == "reference" else one.actions
-            parts.append((*self.observation(one.observed), torch.from_numpy(actions)))
+        for shown in episodes:
+            actions = shown.references if self.control == "reference" else shown.actions
+            parts.append((*self.observation(shown.observed), torch.from_numpy(actions)))
         return Episodes.join(FPS, parts)
 
 
@@ -157,11 +157,11 @@ class NetworkActor:
         self._action: Rows = np.empty(0)
 
     def begin(self, first: Rows) -> None:
-        """Nothing: it looks at the present."""
+        """Do nothing: it looks at the present."""
 
     @torch.inference_mode()
     def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The next action."""
+        """Return the next action."""
         policy, (before, after) = self.training.policy, self.training.processors
         if step == 0:
             policy.reset()
@@ -173,7 +173,7 @@ class NetworkActor:
 
 
 def _recipe(kind: str, check_every: int, **options: Any) -> Recipe:
-    """That of the other benchmarks, at Meta-World's rate and smaller."""
+    """Make the recipe of the other benchmarks smaller, and at Meta-World's rate."""
     recipe = RECIPES[kind]
     options = {**recipe.options, **options}
     return replace(recipe, options=options, rate=FPS, check_every=check_every)

@@ -13,8 +13,8 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "demonstration_seeds", "evaluation_seeds", "read", "recorded", "successes", "validation",
-    "validation_seeds", "write",
+    "demonstration_seeds", "evaluation_seeds", "read", "record_expert", "successes",
+    "validation", "validation_seeds", "write",
 ]  # fmt: skip
 
 #: Demonstrations of training seed s are of the situations ``STRIDE * s`` and on.
@@ -29,7 +29,7 @@ PATIENCE = 5
 
 
 def demonstration_seeds(seed: int, n: int) -> range:
-    """The ``n`` situations that the expert is asked to solve for training seed ``seed``."""
+    """Return the ``n`` situations that the expert is to solve for training seed ``seed``."""
     if not (0 <= seed < EVALUATION // STRIDE and 0 < n <= STRIDE):
         raise DataError(
             f"training seeds are from 0 to {EVALUATION // STRIDE - 1}, with up to {STRIDE} "
@@ -39,18 +39,18 @@ def demonstration_seeds(seed: int, n: int) -> range:
 
 
 def evaluation_seeds(n: int, *, tuning: bool = False) -> range:
-    """The ``n`` situations that policies are tried in; others while ``tuning``."""
+    """Return the ``n`` situations that policies are tried in; others while ``tuning``."""
     first = TUNING if tuning else EVALUATION
     return range(first, first + n)
 
 
 def validation_seeds() -> range:
-    """The situations of demonstrations that nothing is learned from."""
+    """Return the situations of demonstrations that nothing is learned from."""
     return range(VALIDATION, VALIDATION + VALIDATED)
 
 
-def recorded(folder: Path, task: str, seed: int, n: int, least: int) -> list[Recorded]:
-    """The expert's episodes for a training seed, from a file if they are there.
+def record_expert(folder: Path, task: str, seed: int, n: int, least: int) -> list[Recorded]:
+    """Record the expert's episodes for a training seed, or read them from a file.
 
     Where it fails, it is asked for further ones, five times ``n`` in all at most.
 
@@ -59,6 +59,7 @@ def recorded(folder: Path, task: str, seed: int, n: int, least: int) -> list[Rec
     folder : Path
         Where the files are.
     task : str
+        As Meta-World names it.
     seed : int
         As of :func:`demonstration_seeds`.
     n : int
@@ -69,7 +70,7 @@ def recorded(folder: Path, task: str, seed: int, n: int, least: int) -> list[Rec
     asked = max(n, least)
     while True:
         seeds = demonstration_seeds(seed, asked)
-        episodes = _kept(folder / f"{task}-s{seed}.npz", task, seeds)
+        episodes = _read_or_record(folder / f"{task}-s{seed}.npz", task, seeds)
         missing = n - sum(episode.success for episode in episodes)
         if missing <= 0 or asked >= PATIENCE * n:
             return episodes
@@ -77,12 +78,12 @@ def recorded(folder: Path, task: str, seed: int, n: int, least: int) -> list[Rec
 
 
 def validation(folder: Path, task: str) -> list[Recorded]:
-    """The expert's episodes ``validation_seeds()`` that solve the task."""
-    episodes = _kept(folder / f"{task}-validation.npz", task, validation_seeds())
+    """Return the expert's episodes of :func:`validation_seeds` that solve the task."""
+    episodes = _read_or_record(folder / f"{task}-validation.npz", task, validation_seeds())
     return [episode for episode in episodes if episode.success]
 
 
-def _kept(path: Path, task: str, seeds: range) -> list[Recorded]:
+def _read_or_record(path: Path, task: str, seeds: range) -> list[Recorded]:
     episodes = read(path) if path.exists() else []
     there = [episode.seed for episode in episodes]
     if there[: len(seeds)] != [*seeds][: len(there)]:
@@ -96,7 +97,7 @@ def _kept(path: Path, task: str, seeds: range) -> list[Recorded]:
 
 
 def successes(episodes: Sequence[Recorded], n: int, task: str) -> list[Recorded]:
-    """The first ``n`` episodes that solve the task.
+    """Return the first ``n`` episodes that solve the task.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def write(path: Path, episodes: Sequence[Recorded]) -> None:
 
 
 def read(path: Path) -> list[Recorded]:
-    """The episodes at a path that :func:`write` wrote.
+    """Read the episodes that :func:`write` wrote.
 
     Raises
     ------

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from lerobot_env_bimanual.metaworld.tasks import DIFFICULTIES, TASKS, TUNED, difficulty
 from tpgmm_evaluation.report.figures import line_of, success_panels, write
 from tpgmm_evaluation.report.pages import table
-from tpgmm_evaluation.report.significance import REFERENCE, over_tasks
+from tpgmm_evaluation.report.significance import REFERENCE, compare_over_tasks
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, PURPLE, VERMILION
 
 __all__ = [
-    "GROUPS", "LOOKS", "comparison_table", "cost_table", "draw_groups", "summary", "task_table",
+    "GROUPS", "LOOKS", "comparison_table", "cost_table", "draw_groups", "panels", "summary",
+    "task_table",
 ]  # fmt: skip
 
 #: Rows of the summary, and the tasks that they are about.
@@ -37,11 +36,12 @@ LOOKS = {
 }
 #: So many tasks are named in which TP-GMM loses most.
 NAMED = 6
-Result = Mapping[str, Any]
+#: What the columns of a table are about.
+COLUMN = ["policy", "demonstrations"]
 
 
-def summary(results: Iterable[Result]) -> str:
-    """Successes in per cent, with 95 % intervals of Wilson over episodes, as Markdown.
+def summary(episodes: pd.DataFrame) -> str:
+    """Tabulate successes in per cent, with 95 % intervals of Wilson over episodes.
 
     Where there are several training seeds, the interval is followed by the figure of each that
     was tried in all these tasks, and where not all tasks of a group were tried, by how many
@@ -49,67 +49,85 @@ def summary(results: Iterable[Result]) -> str:
 
     Parameters
     ----------
-    results : iterable of mapping
-        Finished cells, as :class:`~tpgmm_evaluation.cells.Results` reads them.
+    episodes : DataFrame
+        As :func:`~tpgmm_evaluation.report.tables.episode_table` makes it.
     """
-    results = list(results)
-    columns, rows = _columns(results), []
+    rows = []
     for group, tasks in GROUPS.items():
-        here = [result for result in results if result["cell"]["env"] in tasks]
-        cells = [
-            _entry([result for result in here if _place(result) == place], len(tasks))
-            for place in columns
-        ]
-        if any(cells):
-            rows.append([f"{group} ({len(tasks)})", *cells])
-    return table(["tasks", *(f"{policy}, {n}" for policy, n in columns)], rows)
+        here = episodes[episodes.env.isin(tasks)]
+        if not here.empty:
+            texts = {place: _share(part, len(tasks)) for place, part in here.groupby(COLUMN)}
+            rows.append([f"{group} ({len(tasks)})", *_in_columns(texts, episodes)])
+    return table(["tasks", *_headings(episodes)], rows)
 
 
-def task_table(results: Iterable[Result]) -> str:
-    """Successes of episodes in finished cells, ``results``, task by task, as Markdown."""
-    results = list(results)
-    columns, rows = _columns(results), []
-    for task in TASKS:
-        here = [r for r in results if r["cell"]["env"] == task]
-        if here:
-            entries = [_counts([r for r in here if _place(r) == place]) for place in columns]
-            half = "tuned" if task in TUNED else "held"
-            rows.append([task, f"{difficulty(task)}, {half}", *entries])
-    return table(["task", "", *(f"{policy}, {n}" for policy, n in columns)], rows)
+def _share(episodes: pd.DataFrame, n_tasks: int) -> str:
+    # each task counts alike, however many of its episodes there are
+    by_task = episodes.groupby("env").success.mean()
+    mean, n = float(by_task.mean()), len(episodes)
+    low, high = wilson(round(mean * n), n)
+    text = f"{100 * mean:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+    # figures of fewer tasks are no figures of the same
+    seeds = episodes.groupby("training_seed").agg({"env": "nunique", "success": "mean"})
+    whole = seeds.success[seeds.env == len(by_task)]
+    if len(whole) > 1:
+        text += " [" + ", ".join(f"{100 * share:.0f}" for share in whole) + "]"
+    return text if len(by_task) == n_tasks else f"{text}, in {len(by_task)} of {n_tasks}"
 
 
-def cost_table(results: Iterable[Result]) -> str:
-    """Costs of training and acting, and why trainings ended, as Markdown.
+def task_table(episodes: pd.DataFrame) -> str:
+    """Tabulate successes task by task; ``episodes`` as for :func:`summary`."""
+    rows = []
+    for task, here in episodes.groupby("env"):
+        texts = {
+            place: f"{part.success.sum()}/{len(part)}" for place, part in here.groupby(COLUMN)
+        }
+        half = "tuned" if task in TUNED else "held"
+        rows.append([task, f"{difficulty(task)}, {half}", *_in_columns(texts, episodes)])
+    rows.sort(key=lambda row: TASKS.index(row[0]))
+    return table(["task", "", *_headings(episodes)], rows)
+
+
+def cost_table(results: Iterable[Mapping[str, Any]]) -> str:
+    """Tabulate costs of training and acting, and why trainings ended.
 
     Medians over the finished cells, ``results``, in seconds of the processor for a training and
     in milliseconds for an action.
     """
-    results = list(results)
-    rows: list[list[object]] = []
-    for policy, n in _columns(results):
-        here = [r for r in results if _place(r) == (policy, n)]
-        training = np.median([result["training_seconds"] for result in here])
-        action = np.median([_action_seconds(result) for result in here])
-        ends = Counter(result["training_outcome"] for result in here)
-        reasons = "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common())
-        rows.append(
-            [f"{policy}, {n}", len(here), f"{training:.3g}", f"{1e3 * action:.3g}", reasons]
-        )
+    cells = pd.DataFrame(
+        {
+            **result["cell"],
+            "training": result["training_seconds"],
+            "outcome": result["training_outcome"],
+            "action": 1e3
+            * sum(episode["acting_seconds"] for episode in result["episodes"])
+            / sum(episode["steps"] for episode in result["episodes"]),
+        }
+        for result in results
+    )
+    groups = dict(list(cells.groupby(COLUMN)))
+    rows = []
+    for policy, n in _columns(cells):
+        here = groups[policy, n]
+        ends = here.outcome.value_counts(sort=True)
+        reasons = "; ".join(f"{outcome}: {count}" for outcome, count in ends.items())
+        medians = (f"{here[key].median():.3g}" for key in ("training", "action"))
+        rows.append([f"{policy}, {n}", len(here), *medians, reasons])
     head = ["", "trainings", "training [s]", "action [ms]", "why trainings ended"]
     return table(head, rows)
 
 
 def comparison_table(episodes: pd.DataFrame) -> str:
-    """TP-GMM beside each other policy, over the tasks that both were tried in, as Markdown.
+    """Compare TP-GMM with each other policy, over the tasks that both were tried in.
 
     Parameters
     ----------
     episodes : DataFrame
-        As :func:`~tpgmm_evaluation.report.tables.episode_table` makes it.
+        As for :func:`summary`.
     """
     head = ["beside", "tasks", "TP-GMM", "other", "difference", "better", "worse", "p"]
     rows = []
-    for row in over_tasks(episodes).itertuples():
+    for row in compare_over_tasks(episodes).itertuples():
         lost = row.differences[row.differences < 0].sort_values()
         rows.append(
             [
@@ -127,8 +145,8 @@ def comparison_table(episodes: pd.DataFrame) -> str:
     return table([*head, "loses most"], rows) if rows else ""
 
 
-def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
-    """Success over the number of demonstrations, a panel for each group of tasks.
+def panels(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Select the episodes of the picture: ``env`` is the group of tasks of their panel.
 
     A training seed of a policy is in a panel where it was tried in as many of its tasks as any
     other: shares of some tasks are no rivals of shares of all.
@@ -136,61 +154,38 @@ def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
     Parameters
     ----------
     episodes : DataFrame
-        As of :func:`comparison_table`.
+        As for :func:`summary`.
+    """
+    parts = []
+    for group, tasks in GROUPS.items():
+        part = episodes[episodes.env.isin(tasks)]
+        tried = part.groupby([*COLUMN, "training_seed"]).env.transform("nunique")
+        parts.append(part[tried == tried.max()].assign(env=group))
+    return pd.concat(parts)
+
+
+def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
+    """Draw success over the number of demonstrations, a panel for each group of tasks.
+
+    Parameters
+    ----------
+    episodes : DataFrame
+        As for :func:`summary`.
     path : Path
         Without suffix; ``.pdf`` and ``.webp`` are written.
     """
-    panels, place = [], ["policy", "demonstrations", "training_seed"]
-    for group, tasks in GROUPS.items():
-        part = episodes[episodes.env.isin(tasks)]
-        tried = part.groupby(place).env.transform("nunique")
-        panels.append(part[tried == tried.max()].assign(env=group))
-    write(success_panels(pd.concat(panels), LOOKS), path)
+    write(success_panels(panels(episodes), LOOKS), path)
 
 
-def _action_seconds(result: Result) -> float:
-    episodes = result["episodes"]
-    acting = sum(episode["acting_seconds"] for episode in episodes)
-    return float(acting / sum(episode["steps"] for episode in episodes))
+def _columns(rows: pd.DataFrame) -> list[tuple[str, int]]:
+    """Return policies and numbers of demonstrations in the order of the columns."""
+    places = set(rows[COLUMN].itertuples(index=False, name=None))
+    return sorted(places, key=lambda place: (place[0] != REFERENCE, *place))
 
 
-def _place(result: Result) -> tuple[str, int]:
-    return result["cell"]["policy"], result["cell"]["demonstrations"]
+def _headings(rows: pd.DataFrame) -> Iterator[str]:
+    return (f"{policy}, {n}" for policy, n in _columns(rows))
 
 
-def _columns(results: Sequence[Result]) -> list[tuple[str, int]]:
-    return sorted({_place(result) for result in results}, key=lambda p: (p[0] != REFERENCE, *p))
-
-
-def _episodes(results: Sequence[Result]) -> list[bool]:
-    return [episode["success"] for result in results for episode in result["episodes"]]
-
-
-def _entry(results: Sequence[Result], tasks: int) -> str:
-    successes = _episodes(results)
-    if not successes:
-        return ""
-    # each task counts alike, however many of its episodes there are
-    by_task, of_seed = (_grouped(results, key) for key in ("env", "seed"))
-    mean = float(np.mean([np.mean(_episodes(here)) for here in by_task.values()]))
-    low, high = wilson(round(mean * len(successes)), len(successes))
-    text = f"{100 * mean:.1f} ({100 * low:.0f} to {100 * high:.0f})"
-    # figures of fewer tasks are no figures of the same
-    whole = [of_seed[seed] for seed in sorted(of_seed) if len(of_seed[seed]) == len(by_task)]
-    if len(whole) > 1:
-        shares = [100 * np.mean(_episodes(one)) for one in whole]
-        text += " [" + ", ".join(f"{share:.0f}" for share in shares) + "]"
-    return text if len(by_task) == tasks else f"{text}, in {len(by_task)} of {tasks}"
-
-
-def _grouped(results: Sequence[Result], key: str) -> dict[Any, list[Result]]:
-    """By what their cells have at a key."""
-    groups: dict[Any, list[Result]] = {}
-    for result in results:
-        groups.setdefault(result["cell"][key], []).append(result)
-    return groups
-
-
-def _counts(results: Sequence[Result]) -> str:
-    successes = _episodes(results)
-    return f"{sum(successes)}/{len(successes)}" if successes else ""
+def _in_columns(texts: Mapping[Any, str], rows: pd.DataFrame) -> list[str]:
+    return [texts.get(place, "") for place in _columns(rows)]

@@ -1,4 +1,4 @@
-"""Trying an actor in situations that it has not seen."""
+"""An actor in situations that it has not seen."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from lerobot_env_bimanual.metaworld.hand import FPS
 from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from tpgmm_evaluation.metaworld.learners import Actor
 
-__all__ = ["trials"]
+__all__ = ["try_out"]
 
 #: Where neither hand nor objects move by more than this [m] for so many steps, nothing will
 #: happen any more: the rest of the episode is not simulated.
 STILL, STILL_STEPS = 1e-4, FPS // 2
 
 
-def trials(env: MetaworldStateEnv, actor: Actor, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """One episode in each situation, each until success, rest, or its end.
+def try_out(env: MetaworldStateEnv, actor: Actor, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Play an episode in each situation, each until success, rest, or its end.
 
     Parameters
     ----------
     env : MetaworldStateEnv
         Its ``control`` becomes the actor's.
     actor : Actor
+        What was learned.
     seeds : sequence of int
+        Of the situations.
 
     Returns
     -------

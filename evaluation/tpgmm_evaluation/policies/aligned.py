@@ -26,6 +26,7 @@ class Aligned:
     Parameters
     ----------
     robot : Kinematics
+        Whose joints the references are.
     fps : int
         Time steps per second.
     demonstrations : sequence of Demonstration
@@ -46,13 +47,16 @@ class Aligned:
 
     @classmethod
     def read(cls, path: Path, robot: Kinematics, n: int, synchronous: bool = False) -> Aligned:
-        """The first ``n`` episodes of a LeRobot data set.
+        """Read the first ``n`` episodes of a LeRobot data set.
 
         Parameters
         ----------
         path : Path
+            Its folder.
         robot : Kinematics
+            With the joints that it names.
         n : int
+            How many episodes.
         synchronous : bool, default=False
             Whether the episodes run on one clock as they are.
         """
@@ -63,7 +67,11 @@ class Aligned:
             for joints in ("action", "observation.state")
         )
         fps = round(info.fps)
-        aligned = _extended(commanded) if synchronous else _on_mean_clock(commanded, robot, fps)
+        aligned = (
+            _extend_to_longest(commanded)
+            if synchronous
+            else _on_mean_clock(commanded, robot, fps)
+        )
         return cls(
             robot,
             fps,
@@ -80,23 +88,25 @@ class Aligned:
         return torch.stack([d.joints for d in self.demonstrations]).mean(0)
 
 
-def _extended(demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
-    """All as long as the longest, at whose end the others wait."""
+def _extend_to_longest(demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
+    """Extend demonstrations to the length of the longest, by their last posture."""
     longest = max(demonstrations, key=len)
-    every = []
-    for one in demonstrations:
-        rows = torch.arange(len(longest)).clamp(max=len(one) - 1)
-        frames = {n: f[rows] if f.batch_shape else f for n, f in one.frames.items()}
-        every.append(
-            Demonstration(longest.time, one.joints[rows], frames, one.joint_names, one.events)
+    extended = []
+    for shown in demonstrations:
+        rows = torch.arange(len(longest)).clamp(max=len(shown) - 1)
+        frames = {n: f[rows] if f.batch_shape else f for n, f in shown.frames.items()}
+        extended.append(
+            Demonstration(
+                longest.time, shown.joints[rows], frames, shown.joint_names, shown.events
+            )
         )
-    return every
+    return extended
 
 
 def _on_mean_clock(
     demonstrations: Sequence[Demonstration], robot: Kinematics, fps: int
 ) -> list[Demonstration]:
-    """Warped onto one another, at the mean of the instants that correspond."""
+    """Warp demonstrations onto one another, at the mean of corresponding instants."""
     if len(demonstrations) == 1:
         return list(demonstrations)
     warping = DynamicTimeWarping(robot=robot).fit(demonstrations)
@@ -105,6 +115,6 @@ def _on_mean_clock(
     grid = np.arange(np.floor((mean[-1] - mean[0]) * fps + 1e-6) + 1) / fps
     at = np.interp(grid + mean[0], mean, clock)
     return [
-        retime(one, np.interp(at, clock, path), torch.from_numpy(grid))
-        for path, one in zip(warping.paths_, demonstrations, strict=True)
+        retime(shown, np.interp(at, clock, path), torch.from_numpy(grid))
+        for path, shown in zip(warping.paths_, demonstrations, strict=True)
     ]

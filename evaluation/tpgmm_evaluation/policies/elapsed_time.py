@@ -20,7 +20,7 @@ HARMONICS = torch.arange(1, 17) / LONGEST
 
 
 def time_features(seconds: Tensor) -> Tensor:
-    """The time, and its sine and cosine at frequencies from 1/16 to 1 Hz.
+    """Return the time, and its sine and cosine at frequencies from 1/16 to 1 Hz.
 
     A network that is given a number alone follows a motion as quick as the shaking only after
     very long training.
@@ -28,6 +28,7 @@ def time_features(seconds: Tensor) -> Tensor:
     Parameters
     ----------
     seconds : Tensor of shape (...)
+        Since the beginning of an episode.
 
     Returns
     -------
@@ -67,13 +68,13 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
         self._count = 0
 
     def get_config(self) -> dict[str, Any]:
-        """Its entry in ``policy_preprocessor.json``."""
+        """Return its entry in ``policy_preprocessor.json``."""
         return {"fps": self.fps}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """The environment state grows by the time."""
+        """Add the time to the size of the environment state."""
         observed = dict(features[PipelineFeatureType.OBSERVATION])
         given = observed[OBS_ENV_STATE]
         size = given.shape[-1] + len(time_features(torch.zeros(())))

@@ -44,7 +44,7 @@ class Episodes:
 
     @classmethod
     def read(cls, path: str | Path) -> Episodes:
-        """All episodes of the LeRobot data set, of version 3.0, in a folder."""
+        """Read all episodes of a LeRobot data set of version 3.0."""
         import pyarrow.dataset
 
         from tpgmm_datasets import describe_lerobot
@@ -58,7 +58,7 @@ class Episodes:
 
     @classmethod
     def join(cls, fps: int, parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Episodes:
-        """Episodes given one by one, each by its state, environment and action."""
+        """Join episodes, each given by its state, environment and action."""
         bounds = np.cumsum([0, *(len(state) for state, _, _ in parts)]).tolist()
         columns = [torch.cat(column).float() for column in zip(*parts, strict=True)]
         return cls(fps, dict(zip(COLUMNS, columns, strict=True)), tuple(bounds))
@@ -76,26 +76,26 @@ class Episodes:
             yield tuple(column[start:end] for column in self.columns.values())
 
     def first(self, n: int) -> Episodes:
-        """The first ``n`` episodes."""
+        """Return the first ``n`` episodes."""
         if not 1 <= n <= len(self):
             raise DataError(f"{n} episodes are asked for, there are {len(self)}")
         columns = {name: column[: self.bounds[n]] for name, column in self.columns.items()}
         return Episodes(self.fps, columns, self.bounds[: n + 1])
 
-    def elapsed(self) -> Tensor:
-        """Seconds since the beginning of its episode of every row, shape (N,)."""
+    def elapsed_time(self) -> Tensor:
+        """Compute the seconds since the beginning of its episode of every row, shape (N,)."""
         lengths = np.diff(self.bounds)
         return torch.cat([torch.arange(n) for n in lengths.tolist()]) / self.fps
 
     def with_time(self) -> Episodes:
-        """With what :func:`time_features` makes of the time at the end of the environment."""
-        environment = self.columns[OBS_ENV_STATE], time_features(self.elapsed())
+        """Append :func:`time_features` of the elapsed time to the environment."""
+        environment = self.columns[OBS_ENV_STATE], time_features(self.elapsed_time())
         return replace(
             self, columns={**self.columns, OBS_ENV_STATE: torch.cat(environment, dim=1)}
         )
 
     def on_common_clock(self, *others: Episodes) -> tuple[Episodes, ...]:
-        """These and other episodes, warped in time onto the most typical of these.
+        """Warp these and other episodes in time onto the most typical of these.
 
         The warping is TP-GMM's own: on how fast the joint references move, and where.
         """
@@ -113,7 +113,7 @@ class Episodes:
         return tuple(sets)
 
     def _demonstrations(self) -> list[Demonstration]:
-        """State and action side by side: what moves them apart must warp them alike."""
+        """Put state and action side by side, so that they are warped alike."""
         return [
             Demonstration(torch.arange(len(s)) / self.fps, torch.cat((s, a), dim=1).double())
             for s, _, a in self
@@ -158,11 +158,12 @@ class Windows:
         return len(self.first)
 
     def at(self, rows: Tensor) -> dict[str, Tensor]:
-        """The windows whose present step is at these rows.
+        """Return the windows whose present step is at these rows.
 
         Parameters
         ----------
         rows : Tensor of shape (B,)
+            Rows of the recording.
 
         Returns
         -------
@@ -183,7 +184,7 @@ class Windows:
 
 
 def policy_stride(fps: int, rate: int) -> int:
-    """How many rows of a recording a step of a policy takes.
+    """Return the number of rows of a recording for one step of a policy.
 
     Raises
     ------

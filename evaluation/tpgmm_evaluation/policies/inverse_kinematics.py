@@ -48,11 +48,12 @@ def follow_poses(
     orientations: bool = True,
     tolerance: float = 0.01,
 ) -> Tensor:
-    """Joints with which links follow poses, shape (T, n_joints), as near as they can.
+    """Find joints with which links follow poses, shape (T, n_joints), as near as they can.
 
     Parameters
     ----------
     robot : Robot
+        With the links, and limits of its joints.
     poses : mapping of str to Frame
         By link, T poses each in the robot's base frame. The first are those at the start.
     start : array-like of shape (n_joints,)
@@ -107,7 +108,7 @@ def follow_poses(
         wanted = {link: frame[step] for link, frame in poses.items()}
         joints.append(solver.step(wanted, postures[step]))
     found = robot.joint_tensor(torch.stack(joints))
-    if missed := _missed(robot, found, poses, orientations, tolerance):
+    if missed := _describe_misses(robot, found, poses, orientations, tolerance):
         warnings.warn(
             f"the poses are missed: {missed}. They are out of reach, faster than the joints "
             "may move, or far from the start",
@@ -126,11 +127,12 @@ def reach(
     orientations: bool = True,
     tolerance: float = 1e-4,
 ) -> Tensor:
-    """Joints at which links have given poses, shape (n_joints,), found from a start.
+    """Find joints at which links have given poses, shape (n_joints,), from a start.
 
     Parameters
     ----------
     robot : Robot
+        With the links, and limits of its joints.
     poses : mapping of str to Frame
         By link, one pose each in the robot's base frame.
     start : array-like of shape (n_joints,)
@@ -161,7 +163,7 @@ def reach(
     solver = _Solver(robot, poses, start, RATE, orientations)
     rest = robot.joint_tensor(solver.joints if posture is None else posture)
     for _ in range(MOST_STEPS):
-        missed = _missed(robot, solver.joints, poses, orientations, tolerance)
+        missed = _describe_misses(robot, solver.joints, poses, orientations, tolerance)
         if not missed:
             return robot.joint_tensor(solver.joints)
         solver.step(poses, rest)
@@ -171,14 +173,14 @@ def reach(
     )
 
 
-def _missed(
+def _describe_misses(
     robot: Robot,
     joints: Tensor,
     poses: Mapping[str, Frame],
     orientations: bool,
     tolerance: float,
 ) -> str:
-    """Largest distance of links from their poses, of those farther than a tolerance."""
+    """Describe the largest distance of links from their poses, if beyond a tolerance."""
     joints = robot.joint_tensor(joints)
     state, texts = robot.state(joints), []
     for link, pose in poses.items():
@@ -233,7 +235,7 @@ class _Solver:
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
 
     def step(self, poses: Mapping[str, Frame], posture: Tensor) -> Tensor:
-        """The joints one period later, on the way to the poses and the posture."""
+        """Move the joints for one period towards the poses and the posture."""
         self.posture.set_target(posture[self.columns].cpu().double().numpy())
         for link, pose in poses.items():
             orientation, position = pose.orientation.cpu().numpy(), pose.position.cpu().numpy()
@@ -254,7 +256,7 @@ class _Solver:
 
 
 def _within_limits(robot: Robot, start: Any, columns: list[int]) -> Tensor:
-    """The start, where some joints begin at a limit if they are beyond it."""
+    """Return the start, with joints that are beyond a limit at that limit."""
     joints = robot.joint_tensor(start)
     if joints.ndim != 1:
         raise ShapeError(f"one start is needed, got {tuple(joints.shape)}")
@@ -275,7 +277,7 @@ def _within_limits(robot: Robot, start: Any, columns: list[int]) -> Tensor:
 
 
 def _model(robot: Robot) -> tuple[Any, list[int]]:
-    """A MuJoCo model that moves as the robot does, and which joints it has, in its order."""
+    """Build a MuJoCo model of the robot; return it and its joints, in its order."""
     import mujoco
 
     spec = mujoco.MjSpec()

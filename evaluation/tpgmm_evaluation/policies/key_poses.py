@@ -7,9 +7,9 @@ has a key pose: the mean of the demonstrations, in the frame in which it differs
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from itertools import chain, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,7 @@ class KeyPose:
     held: str | None = None
 
     def target(self, frames: Mapping[str, Frame], link: Frame) -> Frame:
-        """The link's pose in the base frame, now.
+        """Compute the link's pose in the base frame, now.
 
         Parameters
         ----------
@@ -101,12 +101,12 @@ class Move:
     poses: tuple[tuple[KeyPose, ...], ...]
 
     def config(self) -> dict[str, Any]:
-        """Ready for JSON."""
+        """Return it as JSON holds it."""
         return asdict(self)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Move:
-        """The move that gave this :meth:`config`."""
+        """Make the move that gave this :meth:`config`."""
         poses = tuple(
             tuple(KeyPose(**{**pose, "pose": tuple(pose["pose"])}) for pose in at)
             for at in config["poses"]
@@ -119,7 +119,7 @@ class Move:
         frames: Mapping[str, Frame],
         first: Mapping[str, Frame],
     ) -> dict[str, list[Frame]]:
-        """Of each link, its poses in the base frame at ``steps``.
+        """Compute the poses of each link in the base frame at ``steps``.
 
         Parameters
         ----------
@@ -130,17 +130,16 @@ class Move:
         """
         known = {BASE: Frame(torch.zeros(3, dtype=torch.float64)), **frames}
         known |= {f"{name}{FIRST}": pose for name, pose in first.items()}
-        every: dict[str, list[Frame]] = {link: [] for link in links}
-        for at in self.poses:
-            for key in at:
-                every[key.link].append(key.target(known, links[key.link]))
-        return every
+        targets: dict[str, list[Frame]] = {link: [] for link in links}
+        for key in chain.from_iterable(self.poses):
+            targets[key.link].append(key.target(known, links[key.link]))
+        return targets
 
 
 def minimum_jerk_path(
     start: Frame, poses: Sequence[Frame], steps: Sequence[int], at: Array
 ) -> Frame:
-    """The smoothest path through poses, at rest at both ends.
+    """Interpolate poses by the smoothest path, at rest at both ends.
 
     Parameters
     ----------
@@ -163,7 +162,7 @@ def minimum_jerk_path(
     positions = as_array(torch.stack([start.position, *(pose.position for pose in poses)]))
     back = quaternions.conjugate(start.orientation)
     turns = torch.stack([quaternions.product(pose.orientation, back) for pose in poses])
-    vectors = np.vstack((np.zeros(3), as_array(_unwound(quaternions.log(turns)))))
+    vectors = np.vstack((np.zeros(3), as_array(_unwind(quaternions.log(turns)))))
     still = [(1, np.zeros(6)), (2, np.zeros(6))]
     columns = np.hstack((positions, vectors))
     spline = make_interp_spline(knots, columns, k=5, bc_type=(still, still))
@@ -172,21 +171,21 @@ def minimum_jerk_path(
     return Frame(values[:, :3], turned)
 
 
-def _unwound(vectors: Tensor) -> Tensor:
-    """Rotation vectors, each by the whole turns that bring it nearest to the one before."""
-    every = [vectors[0]]
+def _unwind(vectors: Tensor) -> Tensor:
+    """Add whole turns to rotation vectors, so that each is nearest to the one before."""
+    near = [vectors[0]]
     for vector in vectors[1:]:
         angle = float(vector.norm())
         if angle > 1e-9:
             axis = vector / angle
-            turns = torch.round((every[-1] @ axis - angle) / (2 * torch.pi))
+            turns = torch.round((near[-1] @ axis - angle) / (2 * torch.pi))
             vector = vector + 2 * torch.pi * turns * axis
-        every.append(vector)
-    return torch.stack(every)
+        near.append(vector)
+    return torch.stack(near)
 
 
 def find_moves(aligned: Aligned, tolerance: float | None = 0.005) -> list[Move]:
-    """The moves of a skill, with the key poses of all links.
+    """Find the moves of a skill, with the key poses of all links.
 
     Parameters
     ----------
@@ -225,11 +224,11 @@ class _Shown:
         length = len(self.mean)
         states = [self.robot.state(d.joints) for d in demonstrations]
         self.links = {
-            link: _stacked([Frame(s.position(link), s.orientation(link)) for s in states])
+            link: _stack([Frame(s.position(link), s.orientation(link)) for s in states])
             for link in self.robot.links
         }
         objects = {
-            name: _stacked([_at_all(d.frame(name), length) for d in demonstrations])
+            name: _stack([_at_all(d.frame(name), length) for d in demonstrations])
             for name in demonstrations[0].frames
         }
         self.objects = tuple(objects)
@@ -248,7 +247,7 @@ class _Shown:
             yield Move(begin if number else 0, begin, arrive, end, steps, poses)
 
     def _spans(self) -> Iterator[tuple[int, int]]:
-        """From when to when the mean motion moves, between rests."""
+        """Find from when to when the mean motion moves, between rests."""
         rests = [0.0, *(stop.time for stop in find_stops(self.mean, self.robot, dwell=0.0))]
         rests.append(float(self.mean.time[-1]))
         path = self._path()
@@ -266,7 +265,7 @@ class _Shown:
                 yield round(begin * self.fps), round(arrive * self.fps)
 
     def _path(self) -> Array:
-        """The way of all links of the mean motion together up to each step [m]."""
+        """Measure the way of all links of the mean motion together up to each step [m]."""
         state = self.robot.state(self.mean.joints)
         columns = []
         for link in self.robot.links:
@@ -277,28 +276,32 @@ class _Shown:
         return np.concatenate(([0.0], np.cumsum(moved + 1e-12)))
 
     def _steps(self, begin: int, arrive: int, tolerance: float | None) -> tuple[int, ...]:
-        """Where key poses are: at the end, at events, and where the way is another."""
-        events = [at for name, at in self.mean.events.items()]
+        """Place key poses at the end, at events, and where paths leave the demonstrations."""
+        events = [*self.mean.events.values()]
         events += [change.time for change in find_gripper_changes(self.mean)]
         margin = round(SHORTEST * self.fps)
         steps = {round(at * self.fps) for at in events}
         steps = {s for s in steps if begin + margin < s < arrive - margin} | {arrive}
         while tolerance is not None and len(steps) <= MOST:
-            ways = self._deviation(begin, sorted(steps))
-            allowed = np.ones(len(ways), dtype=bool)
-            for step in (begin, *steps):
-                low = max(0, step - begin - margin)
-                allowed[low : max(0, step - begin + margin + 1)] = False
-            worst = int(np.where(allowed, ways, 0.0).argmax())
-            if not allowed[worst] or ways[worst] <= tolerance:
+            deviation = self._deviation(begin, sorted(steps))
+            deviation[self._neighbourhood(begin, steps, margin)] = 0.0
+            worst = int(deviation.argmax())
+            if deviation[worst] <= tolerance:
                 break
             steps.add(begin + worst)
         return tuple(sorted(steps))
 
-    def _deviation(self, begin: int, steps: Sequence[int]) -> Array:
-        """How far demonstrations are from paths through their own poses, in the mean.
+    @staticmethod
+    def _neighbourhood(begin: int, steps: Iterable[int], margin: int) -> list[int]:
+        """Return the rows, counted from ``begin``, near it or near a key pose."""
+        last = max(steps)
+        around = product((begin, *steps), range(-margin, margin + 1))
+        return [step + by - begin for step, by in around if begin <= step + by <= last]
 
-        Of the links, the one that is farthest.
+    def _deviation(self, begin: int, steps: Sequence[int]) -> Array:
+        """Compute the mean distance of demonstrations from paths through their key poses.
+
+        Of the links, that of the farthest.
         """
         rows = np.arange(steps[-1] - begin + 1, dtype=np.float64)
         ways = []
@@ -309,15 +312,15 @@ class _Shown:
                 path = minimum_jerk_path(
                     shown[i, begin], poses, [step - begin for step in steps], rows
                 )
-                apart += as_array(_apart(path, shown[i, begin : steps[-1] + 1])) / self.n
+                apart += as_array(_distance(path, shown[i, begin : steps[-1] + 1])) / self.n
             ways.append(apart)
         return np.max(ways, axis=0)
 
     def _poses(self, begin: int, step: int) -> tuple[KeyPose, ...]:
-        """Of each link, in the frame in which it differs least."""
-        every = []
+        """Choose for each link the frame in which its pose differs least."""
+        chosen = []
         for link, shown in self.links.items():
-            held = self._held(shown, begin, step)
+            held = self._find_carried_objects(shown, begin, step)
             candidates: list[tuple[float, KeyPose]] = []
             for name, frame in self.frames.items():
                 if name not in held:  # the hand stays with what it holds: no news
@@ -328,11 +331,11 @@ class _Shown:
                         candidates.append(
                             self._candidate(link, pose, name, frame, begin, step, thing)
                         )
-            every.append(min(candidates, key=lambda pair: pair[0])[1])
-        return tuple(every)
+            chosen.append(min(candidates, key=lambda pair: pair[0])[1])
+        return tuple(chosen)
 
-    def _held(self, shown: Frame, begin: int, step: int) -> list[str]:
-        """Which objects a link, and what else, carries from the beginning to a step."""
+    def _find_carried_objects(self, shown: Frame, begin: int, step: int) -> list[str]:
+        """Find the objects that a link carries from the beginning to a step."""
         times = [at / self.fps for at in (begin, step)]
         held = []
         for hold in self.holds:
@@ -353,29 +356,31 @@ class _Shown:
         step: int,
         held: str | None = None,
     ) -> tuple[float, KeyPose]:
-        """How much a pose differs in a frame that is seen at the beginning, and its mean."""
+        """Compute the spread of a pose in a frame seen at the beginning, and its mean."""
         inner = shown[:, step].seen_from(frame[:, begin])
         mean = Frame(inner.position.mean(0), quaternions.mean(inner.orientation))
-        spread = float(_apart(inner, mean.expand((self.n,))).square().mean())
+        spread = float(_distance(inner, mean.expand((self.n,))).square().mean())
         if self.n == 1:  # no spread: what is near counts, the base where nothing else is
             spread = float(inner.position.square().sum()) + (1e6 if name == BASE else 0.0)
         values = (*mean.position.tolist(), *mean.orientation.tolist())
         return spread, KeyPose(link, name, values, held)
 
 
-def _apart(one: Frame, other: Frame) -> Tensor:
-    """How far poses are from one another, turns included [m]."""
-    turn = quaternions.product(quaternions.conjugate(one.orientation), other.orientation)
+def _distance(poses: Frame, others: Frame) -> Tensor:
+    """Compute the distance of poses from others, turns included [m]."""
+    turn = quaternions.product(quaternions.conjugate(poses.orientation), others.orientation)
     angle = quaternions.log(turn).norm(dim=-1)
-    return ((one.position - other.position).square().sum(-1) + (LEVER * angle).square()).sqrt()
+    return (
+        (poses.position - others.position).square().sum(-1) + (LEVER * angle).square()
+    ).sqrt()
 
 
 def _at_all(frame: Frame, length: int) -> Frame:
     return frame if frame.batch_shape else frame.expand((length,))
 
 
-def _stacked(frames: Sequence[Frame]) -> Frame:
-    """Of (T,) each, (N, T)."""
+def _stack(frames: Sequence[Frame]) -> Frame:
+    """Join N frames of shape (T,) to one of shape (N, T)."""
     return Frame(
         torch.stack([frame.position for frame in frames]),
         torch.stack([frame.orientation for frame in frames]),
@@ -383,10 +388,12 @@ def _stacked(frames: Sequence[Frame]) -> Frame:
 
 
 def _mean(aligned: Aligned) -> Demonstration:
-    """The mean motion, with the mean of events that all have."""
-    every = aligned.demonstrations
-    shared = set(every[0].events).intersection(*(d.events for d in every))
-    events = {name: float(np.mean([d.events[name] for d in every])) for name in shared}
+    """Average the motions, and the events that all of them have."""
+    first, *others = aligned.demonstrations
+    shared = set(first.events).intersection(*(d.events for d in others))
+    events = {
+        name: float(np.mean([d.events[name] for d in (first, *others)])) for name in shared
+    }
     return Demonstration(
-        every[0].time, aligned.mean, joint_names=aligned.robot.joint_names, events=events
+        first.time, aligned.mean, joint_names=aligned.robot.joint_names, events=events
     )

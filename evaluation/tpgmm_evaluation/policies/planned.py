@@ -1,4 +1,4 @@
-"""Common parts of the baselines: those that plan ahead, and those that predict actions."""
+"""Common parts of the baselines that plan ahead."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ from tpgmm_torch import Frame
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = [
-    "ChunkedConfig", "ChunkedPolicy", "Observed", "PlannedConfig", "PlannedPolicy",
-    "SituatedConfig", "SituatedPolicy",
-]  # fmt: skip
+__all__ = ["Observed", "PlannedConfig", "PlannedPolicy", "SituatedConfig", "SituatedPolicy"]
 
 
 @dataclass
@@ -30,10 +27,10 @@ class PlannedConfig(StatePolicyConfig):
     """Configuration of a :class:`PlannedPolicy`."""
 
     def validate_features(self) -> None:
-        """Nothing to check."""
+        """Accept all features."""
 
     def get_optimizer_preset(self) -> SGDConfig:
-        """Nothing is trained by gradient."""
+        """Return a preset that LeRobot asks for; nothing is trained by gradient."""
         return SGDConfig()
 
 
@@ -60,13 +57,9 @@ class PlannedPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """The steps at which it looks and plans, from the first, 0, on."""
         return (0,)
 
-    def due(self, step: int) -> bool:
-        """Whether it plans at a step."""
-        return step in self.looks
-
     @abstractmethod
     def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
-        """Actions (B, n, n_action) from a step on, from what is observed then.
+        """Plan actions (B, n, n_action) from a step on, from what is observed then.
 
         Parameters
         ----------
@@ -83,23 +76,23 @@ class PlannedPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next action."""
-        if self._plan is None or self.due(self._step):
+        """Return the next action."""
+        if self._plan is None or self._step in self.looks:
             self._plan, self._planned = self.plan(batch, self._step), self._step
         row = min(self._step - self._planned, self._plan.shape[1] - 1)
         self._step += 1
         return self._plan[:, row]
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """One action as a chunk."""
+        """Return one action as a chunk."""
         return self.select_action(batch)[:, None]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """There is no loss."""
+        """Refuse: there is no loss."""
         raise NotImplementedError(f"{self.name} is fitted at once, not by gradient")
 
     def get_optim_params(self) -> Any:
-        """No parameters."""
+        """Return no parameters."""
         return []
 
 
@@ -131,7 +124,7 @@ class SituatedConfig(PlannedConfig):
 
     @classmethod
     def of(cls, aligned: Aligned, **fields: Any) -> Self:
-        """For demonstrations of a skill."""
+        """Describe demonstrations of a skill, with ``fields`` of the configuration."""
         names = aligned.state_names, aligned.environment_names, aligned.action_names
         return cls(
             fps=aligned.fps,
@@ -208,14 +201,10 @@ class SituatedPolicy(PlannedPolicy):
         """Learn from aligned demonstrations; ``options`` are fields of the configuration."""
         policy = cls(cls.config_class.of(aligned, **options))
         policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
-        policy.learn(aligned)
         return policy.eval()
 
-    def learn(self, aligned: Aligned) -> None:
-        """Learn what is more than the mean: nothing."""
-
     def recipe(self) -> dict[str, Any]:
-        """How it was made, for the record."""
+        """Describe how it was made, for the record."""
         return {}
 
     def reset(self) -> None:
@@ -226,65 +215,20 @@ class SituatedPolicy(PlannedPolicy):
 
     @abstractmethod
     def references(self, seen: Observed) -> Tensor:
-        """Joint references (n, n_joints) of one robot from a step on."""
+        """Plan joint references (n, n_joints) of one robot from a step on."""
 
     def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
-        """Actions from a step on, one robot after the other."""
+        """Plan actions from a step on, one robot after the other."""
         measured = self.joints.joints(batch[OBS_STATE].double())
         seen = self.objects.frames(batch)
-        every = [{name: f[i] for name, f in seen.items()} for i in range(len(measured))]
+        frames = [{name: f[i] for name, f in seen.items()} for i in range(len(measured))]
         if not self._first:
-            self._first = every
+            self._first = frames
         joints = measured if self._last is None else self._last
         plans = [
-            self.references(Observed(joints[i], measured[i], every[i], self._first[i], step))
+            self.references(Observed(joints[i], measured[i], frames[i], self._first[i], step))
             for i in range(len(measured))
         ]
         planned = torch.stack(plans).clamp(self.robot.lower, self.robot.upper)
         self._last = planned[:, -1]
         return self.joints.action(planned)
-
-
-@dataclass
-class ChunkedConfig(PlannedConfig):
-    """Configuration of a :class:`ChunkedPolicy`.
-
-    Parameters
-    ----------
-    n_action_steps : int
-        How many actions are predicted, and taken before the next prediction.
-    """
-
-    n_action_steps: int = 8
-
-    @property
-    def action_delta_indices(self) -> list[int]:  # type: ignore[override]
-        """The steps whose actions are predicted."""
-        return list(range(self.n_action_steps))
-
-
-class ChunkedPolicy(PlannedPolicy):
-    """Takes the actions of a prediction one after the other, then predicts again.
-
-    Parameters
-    ----------
-    config : ChunkedConfig
-    **unused
-        What else LeRobot passes.
-    """
-
-    config_class = ChunkedConfig
-    config: ChunkedConfig
-    name = "chunked"
-
-    def due(self, step: int) -> bool:
-        """Whether all predicted actions were taken."""
-        return step % self.config.n_action_steps == 0
-
-    @abstractmethod
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next actions, shape (B, n_action_steps, n_action)."""
-
-    def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
-        """The prediction."""
-        return self.predict_action_chunk(batch)

@@ -77,11 +77,11 @@ class NearestPolicy(PlannedPolicy):
         return policy.eval()
 
     def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
-        """The actions of the demonstrations that are nearest."""
+        """Return the actions of the demonstrations that are nearest."""
         return self.actions[self._distance(batch[OBS_ENV_STATE]).argmin(dim=1)]
 
     def _distance(self, poses: Tensor) -> Tensor:
-        """Between each of these poses and each demonstration's, shape (B, n)."""
+        """Compute distances of poses from each demonstration's, shape (B, n)."""
         given = poses[:, None].unflatten(-1, (-1, POSE))
         kept = self.poses[None].unflatten(-1, (-1, POSE))
         squares = (given[..., :3] - kept[..., :3]).square().sum(-1)

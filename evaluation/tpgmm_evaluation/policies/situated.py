@@ -1,9 +1,8 @@
-"""Key poses reached by inverse kinematics, and movement primitives led by them."""
+"""Key poses reached by inverse kinematics, and the mean of the demonstrations."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
@@ -22,10 +21,7 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = [
-    "KeyPosesConfig", "KeyPosesPolicy", "MeanConfig", "MeanPolicy", "MovesConfig",
-    "MovesPolicy",
-]  # fmt: skip
+__all__ = ["KeyPosesConfig", "KeyPosesPolicy", "MeanConfig", "MeanPolicy"]
 
 #: For how long the present posture fades into the mean motion [s].
 FADE = 1.0
@@ -33,8 +29,8 @@ FADE = 1.0
 SOLVED = 25
 
 
-def faded(start: Tensor, mean: Tensor, usual: Tensor, fps: int) -> Tensor:
-    """A mean motion (T, n_joints) from where the robot is, ``start`` instead of ``usual``."""
+def fade_into_mean(start: Tensor, mean: Tensor, usual: Tensor, fps: int) -> Tensor:
+    """Return a mean motion (T, n_joints) that begins at ``start`` instead of ``usual``."""
     done = minimum_jerk(torch.arange(len(mean), dtype=torch.float64) / (FADE * fps))
     return mean + (1 - done)[:, None] * (start - usual)
 
@@ -52,42 +48,52 @@ class MeanPolicy(SituatedPolicy):
     name = "mean_demonstration"
 
     def references(self, seen: Observed) -> Tensor:
-        """The mean, into which the present posture fades within a second."""
-        return faded(seen.joints, self.mean, self.start, self.config.fps)
+        """Return the mean, into which the present posture fades within a second."""
+        return fade_into_mean(seen.joints, self.mean, self.start, self.config.fps)
 
 
+@PreTrainedConfig.register_subclass("key_poses")
 @dataclass
-class MovesConfig(SituatedConfig):
-    """Base configuration of policies that go from key pose to key pose.
+class KeyPosesConfig(SituatedConfig):
+    """Configuration of :class:`KeyPosesPolicy`.
 
     Parameters
     ----------
     moves : list of dict
         Each a :class:`Move`.
     tolerance : float, optional
-        With which they are found, as :func:`find_moves` takes it.
+        With which they are found, as :func:`find_moves` takes it [m].
+    posture : bool, default=False
+        Whether the demonstrated posture is sought in the null space; otherwise it is the one
+        in which the move begins.
     """
 
     moves: list[dict[str, Any]] = field(default_factory=list)
     tolerance: float | None = 0.005
+    posture: bool = False
 
 
-class MovesPolicy(SituatedPolicy):
-    """Looks at the beginning of each move for where its key poses are.
+class KeyPosesPolicy(SituatedPolicy):
+    """Goes from key pose to key pose along minimum-jerk paths, by inverse kinematics of mink.
+
+    What the field would try first: the poses of the hands, seen from the objects, at the
+    instants that matter. It looks at the beginning of each move for where its key poses are.
+    Coordinates without kinematics, like a gripper, do as in the mean.
 
     Parameters
     ----------
-    config : MovesConfig
+    config : KeyPosesConfig
+        Robot, moves and options.
     **unused
         What else LeRobot passes.
     """
 
-    config_class = MovesConfig
-    config: MovesConfig
-    name = "moves"
+    config_class = KeyPosesConfig
+    config: KeyPosesConfig
+    name = "key_poses"
     robot: Robot
 
-    def __init__(self, config: MovesConfig, **unused: Any) -> None:
+    def __init__(self, config: KeyPosesConfig, **unused: Any) -> None:
         super().__init__(config)
         self.moves = [Move.from_config(move) for move in config.moves]
 
@@ -112,7 +118,7 @@ class MovesPolicy(SituatedPolicy):
         return super().fit(aligned, moves=moves, **options)
 
     def recipe(self) -> dict[str, Any]:
-        """Settings that were chosen or found in the demonstrations."""
+        """Describe the settings that were chosen or found in the demonstrations."""
         usual = {part.name for part in fields(SituatedConfig)} | {"moves"}
         chosen = [part.name for part in fields(self.config) if part.name not in usual]
         frames = [
@@ -125,88 +131,44 @@ class MovesPolicy(SituatedPolicy):
 
     @property
     def looks(self) -> tuple[int, ...]:
-        """Where moves begin."""
+        """The steps at which moves begin."""
         return tuple(move.look for move in self.moves)
-
-    def move_at(self, look: int) -> Move:
-        """The move that is planned at a step."""
-        return next(move for move in self.moves if move.look == look)
 
     @property
     def free(self) -> list[int]:
         """The coordinates that move no link, like a gripper."""
-        moved = {body.joint for body in self.robot.tree}
-        return [i for i in range(self.robot.n_joints) if i not in moved]
-
-    def targets(self, move: Move, seen: Observed) -> dict[str, list[Frame]]:
-        """Of each link, its key poses of a move in the base frame, by what is seen now."""
-        return move.targets(self.poses(seen.measured), seen.frames, seen.first)
+        moving = {body.joint for body in self.robot.tree}
+        return [i for i in range(self.robot.n_joints) if i not in moving]
 
     def poses(self, joints: Tensor) -> dict[str, Frame]:
-        """Where the links are."""
+        """Compute the poses of the links at a posture (n_joints,)."""
         state = self.robot.state(joints)
         return {n: Frame(state.position(n), state.orientation(n)) for n in self.robot.links}
 
-    def posture_at(self, step: int, targets: Mapping[str, Frame]) -> Tensor:
-        """The posture nearest to the mean one at a step in which links have poses."""
-        near = self.mean[step].clamp(self.robot.lower, self.robot.upper)
-        here, rows = self.poses(near), np.arange(SOLVED + 10, dtype=np.float64)
-        paths = {
-            link: minimum_jerk_path(here[link], [pose], [SOLVED], rows)
-            for link, pose in targets.items()
-        }
-        return follow_poses(
-            self.robot, paths, near, rate=SOLVED, posture=near, tolerance=math.inf
-        )[-1]
-
-
-@PreTrainedConfig.register_subclass("key_poses")
-@dataclass
-class KeyPosesConfig(MovesConfig):
-    """Configuration of :class:`KeyPosesPolicy`.
-
-    Parameters
-    ----------
-    posture : bool, default=False
-        Whether the demonstrated posture is sought in the null space; otherwise it is the one
-        in which the move begins.
-    """
-
-    posture: bool = False
-
-
-class KeyPosesPolicy(MovesPolicy):
-    """Goes from key pose to key pose along minimum-jerk paths, by inverse kinematics of mink.
-
-    What the field would try first: the poses of the hands, seen from the objects, at the
-    instants that matter. Coordinates without kinematics, like a gripper, do as in the mean.
-    """
-
-    config_class = KeyPosesConfig
-    config: KeyPosesConfig
-    name = "key_poses"
-
     def references(self, seen: Observed) -> Tensor:
-        """The move that begins now, and what is left of it until the next."""
-        move, joints, step = self.move_at(seen.step), seen.joints, seen.step
+        """Plan the move that begins now, and what is left of it until the next."""
+        joints, step = seen.joints, seen.step
+        move = next(move for move in self.moves if move.look == step)
         fps, length = self.config.fps, move.arrive - move.begin
         start = joints.clamp(self.robot.lower, self.robot.upper)
         count = max(2, round(length * SOLVED / fps) + 1)
         rows: Array = np.linspace(0, length, count).astype(np.float64)
         here = self.poses(start)
         steps = [at - move.begin for at in move.steps]
+        targets = move.targets(self.poses(seen.measured), seen.frames, seen.first)
         paths = {
             link: minimum_jerk_path(here[link], poses, steps, rows)
-            for link, poses in self.targets(move, seen).items()
+            for link, poses in targets.items()
         }
-        wanted = faded(joints, self.mean[move.begin :], self.mean[move.begin], fps)
+        mean = self.mean[move.begin :]
+        wanted = fade_into_mean(joints, mean, mean[0], fps)
         posture = wanted[np.round(rows).astype(int)] if self.config.posture else start
         rate = (len(rows) - 1) / length * fps
         # what it misses shows in its episodes
-        solved = follow_poses(
+        solution = follow_poses(
             self.robot, paths, start, rate=rate, posture=posture, tolerance=math.inf
         )
-        spline = CubicSpline(rows, as_array(solved), bc_type="clamped")
+        spline = CubicSpline(rows, as_array(solution), bc_type="clamped")
         after = np.arange(step, move.end) - move.begin
         references = torch.from_numpy(spline(after.clip(0, length)))
         references[:, self.free] = wanted[after.clip(0)][:, self.free]

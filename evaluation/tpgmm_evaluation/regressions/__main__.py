@@ -16,14 +16,13 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from tpgmm_evaluation.regressions.comparison import compared, stored, table
+from tpgmm_evaluation.regressions.comparison import compare_cells, read_pairs, table
 from tpgmm_evaluation.regressions.plan import Plan
-from tpgmm_evaluation.regressions.sections import SECTIONS, measure, timed
+from tpgmm_evaluation.regressions.sections import SECTIONS, measure, measure_times
 from tpgmm_evaluation.regressions.sensitivity import sensitivity
 
 __all__ = ["main"]
@@ -56,32 +55,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; 1 if something failed or is worse."""
     given = _options(arguments)
     torch.set_num_threads(1)
-    form = "-small" if given.small else ""
-    before = given.out / f"baseline{form}"
-    plan = Plan(before, given.small, workers=given.workers)
-    if given.what == "sensitivity":
-        plan = replace(plan, out=given.out / "sensitivity")
-        for line in sensitivity(given.constant or "", plan, given.only.split(",")):
-            print(line, flush=True)
-        return 0
-    if given.what == "compare":
-        plan = replace(plan, out=given.out / f"now{form}")
+    return {"baseline": _measure, "compare": _compare, "sensitivity": _vary}[given.what](given)
+
+
+def _plan(given: argparse.Namespace, folder: str) -> Plan:
+    return Plan(given.out / folder, given.small, workers=given.workers)
+
+
+def _form(given: argparse.Namespace) -> str:
+    return "-small" if given.small else ""
+
+
+def _measure(given: argparse.Namespace, name: str = "baseline", left_out: str = "") -> int:
+    """Measure the sections but one; return how many fail."""
+    plan = _plan(given, f"{name}{_form(given)}")
     if given.again:
         shutil.rmtree(plan.out, ignore_errors=True)
+    sections = [section for section in given.only.split(",") if section != left_out]
+    return int(bool(measure(plan, sections)))
+
+
+def _compare(given: argparse.Namespace) -> int:
+    """Measure the present code, and print what changed; 1 if something is worse."""
     sections = given.only.split(",")
-    beside = given.what == "compare" and given.base is not None and "times" in sections
-    if beside:
-        sections.remove("times")
-    failures = measure(plan, sections)
-    if given.what == "baseline":
-        return int(bool(failures))
-    cells = list(stored(before, plan.out, sections))
+    beside = given.base is not None and "times" in sections
+    left_out = "times" if beside else ""
+    failed = _measure(given, "now", left_out)
+    before, now = (_plan(given, f"{name}{_form(given)}") for name in ("baseline", "now"))
+    cells = list(read_pairs(before.out, now.out, [s for s in sections if s != left_out]))
     for _ in range(given.rounds if beside else 0):
-        turn = timed(given.base, given.small), timed(plan.root, given.small)
-        cells.append(("times", *turn))
-    rows = compared(cells)
+        usual = measure_times(given.base, given.small)
+        cells.append(("times", usual, measure_times(now.root, given.small)))
+    rows = compare_cells(cells)
     print(*table(rows), sep="\n")
-    return int(bool(failures) or any(row.worse for row in rows))
+    return int(failed or any(row.worse for row in rows))
+
+
+def _vary(given: argparse.Namespace) -> int:
+    """Print how much a constant matters."""
+    plan = _plan(given, "sensitivity")
+    for line in sensitivity(given.constant or "", plan, given.only.split(",")):
+        print(line, flush=True)
+    return 0
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from scipy.stats import wilcoxon
 from tpgmm_evaluation.regressions.plan import Measured
 from tpgmm_evaluation.report.significance import LEVEL, holm, mcnemar
 
-__all__ = ["Row", "compared", "stored", "table"]
+__all__ = ["Row", "compare_cells", "read_pairs", "table"]
 
 #: Rounding, relative to the largest value or to 1.
 ROUNDING = 1e-9
@@ -33,6 +33,7 @@ class Row:
     Parameters
     ----------
     name : str
+        Of the group and quantity.
     before, now : float
         Means; of times, medians; of golden references, the largest difference is ``now``.
     n : int
@@ -54,16 +55,17 @@ class Row:
     changed: bool = True
 
 
-def stored(
+def read_pairs(
     before: Path, now: Path, sections: Iterable[str]
 ) -> Iterator[tuple[str, Measured, Measured]]:
-    """Cells of two folders, with the name of their group: the folder they are in.
+    """Read cells of two folders, with the name of their group: the folder they are in.
 
     Parameters
     ----------
     before, now : Path
         As :func:`~tpgmm_evaluation.regressions.sections.measure` fills them.
     sections : iterable of str
+        Which of their folders.
     """
     for section in sections:
         for path in sorted((before / section).rglob("*.npz")):
@@ -72,7 +74,7 @@ def stored(
             yield name, np.load(path), np.load(now / file) if (now / file).exists() else {}
 
 
-def compared(cells: Iterable[tuple[str, Measured, Measured]]) -> list[Row]:
+def compare_cells(cells: Iterable[tuple[str, Measured, Measured]]) -> list[Row]:
     """Compare each quantity, over all cells of a group.
 
     Parameters
@@ -95,14 +97,14 @@ def compared(cells: Iterable[tuple[str, Measured, Measured]]) -> list[Row]:
 
 
 def _gain(kind: str, before: Array, now: Array) -> Array:
-    """By how much each of a pair is better now; what is infinite has no part in it."""
+    """Compute by how much each of a pair is better now; 0 for what is infinite."""
     gain = before - now if kind == "error" else now - before
     same = np.isclose(before, now, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
     return np.where(same | ~np.isfinite(gain), 0.0, gain)
 
 
 def _p_value(kind: str, before: Array, now: Array) -> float:
-    """How likely one cell differs as much by chance; 1 where that is not asked."""
+    """Test whether one cell differs by chance; 1 where that is not asked."""
     if kind in ("same", "seconds") or before.shape != now.shape:
         return 1.0
     gain = _gain(kind, before, now)
@@ -112,35 +114,36 @@ def _p_value(kind: str, before: Array, now: Array) -> float:
 
 
 def _row(kind: str, name: str, pairs: Pairs, p: Array) -> Row:
-    if any(one.shape != other.shape for one, other in pairs):
+    if any(before.shape != now.shape for before, now in pairs):
         return Row(name, np.nan, np.nan, 0, worse="not measured, or of another shape")
     before, now = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
     if kind == "same":
         most = float(np.abs(before - now).max())
-        worse = most > ROUNDING * max(1.0, float(np.abs(before).max()))
-        return Row(name, 0.0, most, len(now), 1.0, "changed" if worse else "", most > 0)
+        changed = most > ROUNDING * max(1.0, float(np.abs(before).max()))
+        return Row(name, 0.0, most, len(now), 1.0, "changed" if changed else "", most > 0)
     if kind == "seconds":
-        one, other = float(np.median(before)), float(np.median(now))
+        usual, taken = float(np.median(before)), float(np.median(now))
         limit = SLOWER_COMPILED if "compiled" in name else SLOWER
-        slow = f"{other / one:.2f} times as long" if other > limit * one else ""
-        return Row(name, one, other, len(now), worse=slow)
+        slow = f"{taken / usual:.2f} times as long" if taken > limit * usual else ""
+        return Row(name, usual, taken, len(now), worse=slow)
+    return _compare_means(kind, name, pairs, p)
+
+
+def _compare_means(kind: str, name: str, pairs: Pairs, p: Array) -> Row:
+    """Compare successes, scores or errors: by the tests of cells, and by the mean."""
+    before, now = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
     gain, both = _gain(kind, before, now), np.isfinite(before) & np.isfinite(now)
-    one, other = (float(each[both].mean()) if both.any() else np.nan for each in (before, now))
+    usual, found = (float(v[both].mean()) if both.any() else np.nan for v in (before, now))
     lost = np.array([_gain(kind, *pair).mean() < 0 for pair in pairs])
     why = "significantly" if (lost & (p < LEVEL)).any() else ""
-    if not why and gain.mean() < -TOLERATED * abs(one):
-        why = f"on average, by {abs(gain.mean() / one):.1%}"
+    if not why and gain.mean() < -TOLERATED * abs(usual):
+        why = f"on average, by {abs(gain.mean() / usual):.1%}"
     changed = bool(gain.any() or (np.isfinite(before) != np.isfinite(now)).any())
-    return Row(name, one, other, len(now), float(p.min()), why, changed)
+    return Row(name, usual, found, len(now), float(p.min()), why, changed)
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
-    """Lines of a table: what changed, and how many quantities did not.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-    """
+    """Format the lines of a table: what changed, and how many quantities did not."""
     shown = [row for row in rows if row.changed or row.worse]
     width = max([4, *(len(row.name) for row in shown)])
     yield f"{'':{width}}{'before':>12}{'now':>12}{'n':>7}{'p':>9}"

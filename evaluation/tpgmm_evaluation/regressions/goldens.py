@@ -29,20 +29,20 @@ __all__ = ["GOLDENS"]
 SITUATIONS, STATES = 10, 64
 
 
-def planted(plan: Plan) -> Measured:
-    """A tracked hand, two frames that matter, and no robot: the task that tests plant."""
-    task = plan.loaded("tests.support.planted").PlantedTask(3, 2)
+def measure_planted(plan: Plan) -> Measured:
+    """Measure a tracked hand, two frames that matter, and no robot: the task of the tests."""
+    task = plan.load_module("tests.support.planted").PlantedTask(3, 2)
     operators = [
         Stack(RelativePosition("hand", name), RelativeOrientation("hand", name))
         for name in task.relevant
     ]
-    situations = [Situation.of(one) for one in task.demonstrations(SITUATIONS, 2)]
+    situations = list(map(Situation.of, task.demonstrations(SITUATIONS, 2)))
     model = TaskParameterizedGMM(8, operators, Poses(["hand"]))
     return _golden(model, task.demonstrations(6, 1), situations)
 
 
-def bottle(plan: Plan) -> Measured:
-    """The paper's skill as ``make demo`` learns it; a small one has a tenth of its instants."""
+def measure_bottle(plan: Plan) -> Measured:
+    """Measure the paper's skill as ``make demo`` learns it, or at a tenth of its rate."""
     skill = BottleShaking(rate=10 if plan.small else 100)
     shown = skill.demonstrations(10, 0)
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(shown)
@@ -50,8 +50,8 @@ def bottle(plan: Plan) -> Measured:
     return _golden(model, aligned, skill.situations(SITUATIONS, 1000))
 
 
-def carried(plan: Plan) -> Measured:
-    """A bottle that both hands take and put on a tray: it is held, and a thing of its own."""
+def measure_carrying(plan: Plan) -> Measured:
+    """Measure a bottle that both hands take, hold and put on a tray."""
     task, skill = benchmark("carry_and_put"), CarryAndPut(rate=10 if plan.small else 50)
     aligned = DynamicTimeWarping(robot=skill.robot).fit_transform(skill.demonstrations(10, 0))
     model = TaskParameterizedGMM(20, task.operators(True), skill.robot)
@@ -60,16 +60,16 @@ def carried(plan: Plan) -> Measured:
 
 #: By the name of the skill.
 GOLDENS: Mapping[str, Callable[[Plan], Measured]] = {
-    "planted": planted,
-    "bottle": bottle,
-    "carried": carried,
+    "planted": measure_planted,
+    "bottle": measure_bottle,
+    "carried": measure_carrying,
 }
 
 
 def _golden(
     model: TaskParameterizedGMM, shown: Sequence[Demonstration], situations: Sequence[Situation]
 ) -> Measured:
-    """Golden values: parameters, likelihood, references, and a batch of single steps."""
+    """Compute parameters, likelihood, references, and a batch of single steps."""
     model.fit(shown)
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(shown[0]), size=STATES)
@@ -82,8 +82,8 @@ def _golden(
     step, paths = model.step(time, joints, frames), model.predict(situations)
     found = {
         "weights": model.weights_,
-        "means": torch.cat([each.flatten() for each in model.means_]),
-        "covariances": torch.cat([each.flatten() for each in model.covariances_]),
+        "means": torch.cat([mean.flatten() for mean in model.means_]),
+        "covariances": torch.cat([matrix.flatten() for matrix in model.covariances_]),
         "score": model.score_samples(shown),
         "step": step.joints,
         "step's covariance": step.covariance,

@@ -46,8 +46,8 @@ class Plan:
     data: Path = Path("../shared/data")
     workers: int = 1
 
-    def loaded(self, module: str) -> Any:
-        """A module of the checkout's examples or tests, which are in no package."""
+    def load_module(self, module: str) -> Any:
+        """Import a module of the checkout's examples or tests, which are in no package."""
         parent = module.partition(".")[0]
         if parent not in sys.modules or not hasattr(sys.modules[parent], "__path__"):
             sys.modules[parent] = types.ModuleType(parent)
@@ -56,6 +56,6 @@ class Plan:
 
 
 def import_paths(root: Path) -> str:
-    """``PYTHONPATH`` with which the packages of a checkout are found."""
-    containers = ("", "datasets", "policies", "environments", "evaluation", "tools")
-    return os.pathsep.join(str(root.resolve() / each) for each in containers)
+    """Return the ``PYTHONPATH`` with which the packages of a checkout are found."""
+    folders = ("control", "datasets", "vision", "tools", "policies", "environments")
+    return os.pathsep.join(str(root.resolve() / name) for name in ("", *folders, "evaluation"))

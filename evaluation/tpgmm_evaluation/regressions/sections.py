@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
-from tpgmm_evaluation.cells import Results
+from tpgmm_evaluation.cells import Cell, Results
 from tpgmm_evaluation.compare import compare
 from tpgmm_evaluation.regressions.goldens import GOLDENS
 from tpgmm_evaluation.regressions.plan import Measured, Plan, import_paths
@@ -28,7 +28,7 @@ from tpgmm_tools.paper.experiment import BottleExperiment
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import TPGMMError
 
-__all__ = ["SECTIONS", "measure", "timed"]
+__all__ = ["SECTIONS", "measure", "measure_times"]
 
 #: Real recordings beside the checkout, and what ``examples/leave_one_out.py`` calls them.
 RECORDINGS = {"g1_bottle": "g1", "honeytea_bimanual": "honeytea", "so101_record": "so101"}
@@ -47,6 +47,7 @@ def measure(plan: Plan, sections: Sequence[str]) -> list[str]:
     Parameters
     ----------
     plan : Plan
+        Where and how much.
     sections : sequence of str
         Keys of ``SECTIONS``.
 
@@ -59,21 +60,26 @@ def measure(plan: Plan, sections: Sequence[str]) -> list[str]:
     for section in sections:
         try:
             for name, work in SECTIONS[section](plan):
-                path = plan.out / section / f"{name}.npz"
-                if not path.exists():
-                    print(f"{section}/{name} ...")
-                    with warnings.catch_warnings(action="ignore"):
-                        cell = work()
-                    with replacing(path) as new, new.open("wb") as file:
-                        np.savez_compressed(file, allow_pickle=False, **cell)
+                _keep(plan.out / section / f"{name}.npz", work, f"{section}/{name} ...")
         except Exception as error:  # one that fails is no reason to lose the others
             failures.append(f"{section}: {type(error).__name__}: {error}")
             print(f"FAILED {failures[-1]}")
     return failures
 
 
+def _keep(path: Path, work: Work, title: str) -> None:
+    """Measure a cell, unless its file is there."""
+    if path.exists():
+        return
+    print(title)
+    with warnings.catch_warnings(action="ignore"):
+        cell = work()
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **cell)
+
+
 def demo(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """The figures that ``make demo`` prints."""
+    """Measure the figures that ``make demo`` prints."""
 
     def work() -> Measured:
         n, rate = (10, 20) if plan.small else (50, 100)
@@ -92,35 +98,45 @@ def demo(plan: Plan) -> Iterator[tuple[str, Work]]:
     yield "figures", work
 
 
+def _grid(disturbed: bool, small: bool) -> tuple[Sequence[str], Sequence[int], Sequence[int]]:
+    """Return the conditions, numbers of demonstrations and seeds of rollouts."""
+    if disturbed:
+        return FEW if small else ("all",), (10,), (0,)
+    return (NOMINAL,), (3, 10), (0,) if small else (0, 1, 2)
+
+
 def rollouts(
     tasks: Sequence[str], policies: Sequence[str], disturbed: bool, plan: Plan
 ) -> Iterator[tuple[str, Work]]:
-    """Cells of ``tpgmm compare``, which resumes by itself: successes and errors of episodes."""
-    conditions = (FEW if plan.small else ("all",)) if disturbed else (NOMINAL,)
-    counts, seeds = ((10,), (0,)) if disturbed else ((3, 10), (0, 1, 2))
+    """Roll out cells of ``tpgmm compare``, which resumes by itself."""
     if plan.small:
-        policies, seeds = policies[:1], seeds[:1]
+        policies = policies[:1]
+    conditions, counts, seeds = _grid(disturbed, plan.small)
     settings = [Settings(task, episodes=6 if plan.small else 34) for task in tasks]
     out = plan.out / "rollouts"
     done = compare(settings, out, policies, counts, seeds, conditions, plan.workers)
     if done.failures:
         raise TPGMMError(f"{len(done.failures)} cells failed: see {out}/TASK/failures")
     for task in settings:
-        errors = [name for name, f in task.benchmark().criteria.items() if f.low == 0]
         for result in Results(out / task.env / "cells").read_all(print):
-            cell, rows = result["cell"], result["episodes"]
-            if cell["policy"] in policies and disturbed == (cell["condition"] != NOMINAL):
-                found = {"success:success": np.array([row["success"] for row in rows], float)}
-                for key in errors:
-                    found[f"error:{key}"] = np.array([row[key] for row in rows], float)
-                group = f"{cell['policy']}-n{cell['demonstrations']}"
-                name = f"{cell['env']}-s{cell['seed']}-{cell['condition']}"
-                yield f"{group}/{name}", partial(dict, found)
+            cell = Cell(**result["cell"])
+            if cell.policy in policies and disturbed == (cell.condition != NOMINAL):
+                name = f"{cell.env}-s{cell.seed}-{cell.condition}"
+                group = f"{cell.policy}-n{cell.demonstrations}"
+                yield f"{group}/{name}", partial(episode_figures, task, result)
+
+
+def episode_figures(task: Settings, result: Mapping[str, Any]) -> Measured:
+    """Collect successes and errors of the episodes of a cell."""
+    errors = [key for key, figure in task.benchmark().criteria.items() if figure.low == 0]
+    names = {"success:success": "success", **{f"error:{key}": key for key in errors}}
+    rows = result["episodes"]
+    return {n: np.array([row[key] for row in rows], float) for n, key in names.items()}
 
 
 def reach(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Bottles out of reach: how calm robots are, and how far from the nearest posture."""
-    example = plan.loaded("examples.out_of_reach")
+    """Measure robots before bottles out of reach: calm, and far from the nearest posture."""
+    example = plan.load_module("examples.out_of_reach")
 
     def work() -> Measured:
         bottles, starts = (20, 10) if plan.small else (200, 60)
@@ -139,8 +155,8 @@ def reach(plan: Plan) -> Iterator[tuple[str, Work]]:
 
 
 def recordings(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Real recordings, one left out: errors at the event and along the path, likelihood."""
-    example = plan.loaded("examples.leave_one_out")
+    """Leave real recordings out: errors at the event and along the path, likelihood."""
+    example = plan.load_module("examples.leave_one_out")
 
     def work(folder: Path, likely: bool) -> Measured:
         recording = example.RECORDINGS[RECORDINGS[folder.name]](folder)
@@ -170,10 +186,10 @@ def recordings(plan: Plan) -> Iterator[tuple[str, Work]]:
 
 
 def mistakes(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Mistakes with recordings and situations: which of them are noticed."""
-    table = plan.loaded("tests.support.mistakes").MISTAKES
+    """Make mistakes with recordings and situations, and count those noticed."""
+    table = plan.load_module("tests.support.mistakes").MISTAKES
 
-    def noticed(mistake: Any) -> bool:
+    def is_noticed(mistake: Any) -> bool:
         messages = []
         with (
             warnings.catch_warnings(record=True) as caught,
@@ -189,13 +205,13 @@ def mistakes(plan: Plan) -> Iterator[tuple[str, Work]]:
 
     def work() -> Measured:
         chosen = table[::8] if plan.small else table
-        return {f"success:{one}": np.array([float(noticed(one))]) for one in chosen}
+        return {f"success:{m}": np.array([float(is_noticed(m))]) for m in chosen}
 
     yield "table", work
 
 
-def timed(root: Path, small: bool) -> Measured:
-    """Seconds of the main work, measured by the checkout at ``root`` with its own code."""
+def measure_times(root: Path, small: bool) -> Measured:
+    """Let the checkout at ``root`` measure the seconds of its main work."""
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "benchmarks", "--only", "main", "--out", out]
         command += ["--repeat", "1"] if small else []
@@ -210,7 +226,7 @@ SECTIONS: Mapping[str, Callable[[Plan], Iterator[tuple[str, Work]]]] = {
     "goldens": lambda plan: ((name, partial(work, plan)) for name, work in GOLDENS.items()),
     "mistakes": mistakes,
     "demo": demo,
-    "times": lambda plan: iter([("main", partial(timed, plan.root, plan.small))]),
+    "times": lambda plan: iter([("main", partial(measure_times, plan.root, plan.small))]),
     "recordings": recordings,
     "reach": reach,
     "suite": partial(rollouts, SUITE, ("tpgmm", "tpgmm-auto"), False),

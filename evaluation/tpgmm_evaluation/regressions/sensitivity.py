@@ -8,14 +8,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tpgmm_evaluation.regressions.comparison import compared, stored
+from tpgmm_evaluation.regressions.comparison import Array, compare_cells, read_pairs
 from tpgmm_evaluation.regressions.plan import Plan, import_paths
 from tpgmm_torch.exceptions import DataError
 
@@ -34,7 +34,9 @@ def sensitivity(
     plan : Plan
         What was measured is kept in ``plan.out``, and measured once.
     sections : sequence of str
+        What is measured.
     factors : sequence of float
+        By which the constant is multiplied.
 
     Yields
     ------
@@ -51,13 +53,13 @@ def sensitivity(
     value = getattr(import_module(module), name, None)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise DataError(f"give a number as MODULE:NAME; {constant} is {value!r}")
-    usual = _measured(plan.out / "usual", plan, sections)
+    usual = _measure(plan.out / "usual", plan, sections)
     for factor in factors:
         other = type(value)(value * factor)
         out = plan.out / f"{module}.{name}={other:g}"
         with tempfile.TemporaryDirectory() as copy:
             _edit(Path(copy), module, name, other)
-            _measured(out, plan, sections, copy)
+            _measure(out, plan, sections, copy)
         yield f"{constant} = {other:g} (usually {value:g}): {_change(usual, out, sections)}"
 
 
@@ -76,8 +78,8 @@ def _edit(copy: Path, module: str, name: str, value: float) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _measured(out: Path, plan: Plan, sections: Sequence[str], copy: str = "") -> Path:
-    """The small form, by a process that finds the copy first."""
+def _measure(out: Path, plan: Plan, sections: Sequence[str], copy: str = "") -> Path:
+    """Measure the small form, by a process that finds the copy first."""
     command = [sys.executable, "-P", "-m", "tpgmm_evaluation.regressions", "baseline"]
     command += ["--small", "--only", ",".join(sections), "--out", str(out.resolve())]
     paths = os.pathsep.join(filter(None, (copy, import_paths(plan.root))))
@@ -86,19 +88,38 @@ def _measured(out: Path, plan: Plan, sections: Sequence[str], copy: str = "") ->
 
 
 def _change(usual: Path, other: Path, sections: Sequence[str]) -> str:
-    pairs = list(stored(usual / "baseline-small", other / "baseline-small", sections))
-    moved: dict[str, list[float]] = {"same": [0.0], "error": [], "score": [], "success": []}
+    """Describe how quantities changed."""
+    pairs = list(read_pairs(usual / "baseline-small", other / "baseline-small", sections))
+    changes: dict[str, list[float]] = {"same": [0.0], "error": [], "score": [], "success": []}
     for _, before, now in pairs:
         for key in set(before) & set(now):
-            kind, one, two = key.partition(":")[0], before[key], now[key]
-            if kind == "same" and one.shape == two.shape and "references" in key:
-                moved[kind].append(np.abs(one - two).max())
-            elif kind == "error" and one.mean() > 0:
-                moved[kind].append(100 * (two.mean() / one.mean() - 1))
-            elif kind in ("score", "success"):
-                moved[kind].append((two - one).mean())
-    worse = sum(bool(row.worse) and row.now != row.before for row in compared(pairs))
-    means = {kind: np.mean(values) for kind, values in moved.items() if values}
+            kind = key.partition(":")[0]
+            if kind in CHANGES:
+                changes[kind] += CHANGES[kind](key, before[key], now[key])
+    worse = sum(bool(row.worse) and row.now != row.before for row in compare_cells(pairs))
+    means = {kind: np.mean(values) for kind, values in changes.items() if values}
     texts = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
     parts = [texts[kind].format(mean) for kind, mean in means.items() if kind in texts]
-    return ", ".join([f"references up to {max(moved['same']):.2g}", *parts, f"{worse} worse"])
+    return ", ".join([f"references up to {max(changes['same']):.2g}", *parts, f"{worse} worse"])
+
+
+def _move_of_references(key: str, before: Array, now: Array) -> list[float]:
+    same = "references" in key and before.shape == now.shape
+    return [float(np.abs(before - now).max())] if same else []
+
+
+def _growth(key: str, before: Array, now: Array) -> list[float]:
+    return [float(100 * (now.mean() / before.mean() - 1))] if before.mean() > 0 else []
+
+
+def _mean_change(key: str, before: Array, now: Array) -> list[float]:
+    return [float((now - before).mean())]
+
+
+#: How much a quantity changed, by its kind; nothing where that says nothing.
+CHANGES: Mapping[str, Callable[[str, Array, Array], list[float]]] = {
+    "same": _move_of_references,
+    "error": _growth,
+    "score": _mean_change,
+    "success": _mean_change,
+}

@@ -11,14 +11,14 @@ import pandas as pd
 from tpgmm_evaluation.benchmarks import Benchmark
 from tpgmm_evaluation.settings import Settings
 
-__all__ = ["criterion", "evaluation_command", "failed_episodes", "missed"]
+__all__ = ["criterion", "evaluation_command", "list_failures", "missed_criteria"]
 
 #: What identifies a failed episode.
 COLUMNS = ["env", "policy", "demonstrations", "training_seed", "condition", "evaluation_seed"]
 
 
 def criterion(benchmark: Benchmark, key: str) -> str:
-    """A figure and the bounds between which it lies in a success."""
+    """Format a figure and the bounds between which it lies in a success."""
     heading, _, low, high = benchmark.figures[key]
     if low == high:
         return f"{heading} = {low:g}"
@@ -27,8 +27,8 @@ def criterion(benchmark: Benchmark, key: str) -> str:
     return f"{heading} ≤ {high:g}" if low <= 0 else f"{heading} {low:g} to {high:g}"
 
 
-def missed(episode: Mapping[str, Any], benchmark: Benchmark) -> list[str]:
-    """The criteria that an episode does not meet.
+def missed_criteria(episode: Mapping[str, Any], benchmark: Benchmark) -> list[str]:
+    """Return the criteria that an episode does not meet.
 
     Parameters
     ----------
@@ -42,10 +42,8 @@ def missed(episode: Mapping[str, Any], benchmark: Benchmark) -> list[str]:
     ]
 
 
-def failed_episodes(
-    episodes: pd.DataFrame, benchmarks: Mapping[str, Benchmark]
-) -> pd.DataFrame:
-    """A row for each episode without success, and what was missed in it.
+def list_failures(episodes: pd.DataFrame, benchmarks: Mapping[str, Benchmark]) -> pd.DataFrame:
+    """Tabulate episodes without success, and what was missed in them.
 
     Parameters
     ----------
@@ -65,7 +63,7 @@ def failed_episodes(
         benchmark = benchmarks[row["env"]]
         texts = [
             f"{criterion(benchmark, key)} ({row.get(key, math.nan):.3g})"
-            for key in missed(row, benchmark)
+            for key in missed_criteria(row, benchmark)
         ]
         if not benchmark.criteria:
             texts = [
@@ -81,7 +79,7 @@ def failed_episodes(
 def evaluation_command(
     settings: Settings, condition: str, policy: str, rate: object, seed: object, trials: object
 ) -> str:
-    """The call of LeRobot's evaluation that repeats episodes.
+    """Return the call of LeRobot's evaluation that repeats episodes.
 
     Parameters
     ----------
@@ -92,7 +90,7 @@ def evaluation_command(
     seed, trials : object
         Of the first episode, and how many there are.
     """
-    options = settings.disturbed(condition)
+    options = settings.disturb(condition)
     given = " ".join(f"--env.{key}={_plain(value)}" for key, value in options.items())
     return (
         f"lerobot-eval --policy.path={policy} --policy.device=cpu "

@@ -38,7 +38,7 @@ BRIGHT = 0.6
 
 
 def _family(policy: str) -> str:
-    """Family of a policy: the shortest name that its own begins with."""
+    """Return the family of a policy: the shortest name that its name begins with."""
     first = policy.split()[0]
     names = (name for name in POLICIES if first == name or first.startswith(f"{name}-"))
     return min(names, key=len, default=first)
@@ -46,7 +46,7 @@ def _family(policy: str) -> str:
 
 @cache
 def _look(policy: str) -> dict[str, Any]:
-    """Colour by family, marker and line by policy; the same in all figures."""
+    """Choose colour by family, marker and line by policy; the same in all figures."""
     family = _family(policy)
     if policy == REFERENCE:
         return line_of(policy, VERMILION, "o") | {"linewidth": 2.0, "zorder": 4}
@@ -65,14 +65,14 @@ def _look(policy: str) -> dict[str, Any]:
 
 
 def _looks(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Those of a table's policies, in the order of the registry."""
+    """Return the looks of a table's policies, in the order of the registry."""
     names = set(table.policy)
     known = [name for name in POLICIES if name in names]
     return {name: _look(name) for name in (*known, *sorted(names - set(known)))}
 
 
 def draw_success(episodes: pd.DataFrame, path: Path) -> None:
-    """Success over the number of demonstrations: a panel for each environment.
+    """Draw success over the number of demonstrations: a panel for each environment.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def draw_success(episodes: pd.DataFrame, path: Path) -> None:
 
 @rc_context(STYLE)
 def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
-    """Success under disturbances: a heat map for each policy.
+    """Draw success under disturbances: a heat map for each policy.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
 
 
 def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, Any]:
-    """Style of all lines of a policy."""
+    """Return the style of all lines of a policy."""
     return {
         "color": colour,
         "marker": marker,
@@ -134,7 +134,7 @@ def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, 
 def panels_for(
     count: int, *, narrowest: float = 0.0, sharey: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of panels, row by row, of at least a width [inch]."""
+    """Make a figure of panels, row by row, of at least a width [inch]."""
     columns = min(COLUMNS, count)
     rows = math.ceil(count / columns)
     size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
@@ -147,7 +147,7 @@ def panels_for(
 
 @rc_context(STYLE)
 def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Success over the number of demonstrations: a panel for each environment.
+    """Draw success over the number of demonstrations in panels, one an environment.
 
     Lines join the shares of all episodes with their 95 % intervals (Wilson), small dots are the
     shares of each training seed, where there are several.
@@ -199,7 +199,7 @@ def _success_line(
 
 
 def spread(counts: Sequence[int], index: int, total: int) -> np.ndarray[Any, Any]:
-    """Numbers of demonstrations, moved a little so that policies do not hide one another."""
+    """Move numbers of demonstrations a little, so that policies do not hide others."""
     width = min(0.04, 0.3 / total)
     return np.asarray(counts) * (1 + width) ** (index - (total - 1) / 2)
 
@@ -219,7 +219,7 @@ def over_demonstrations(axes: Axes, table: pd.DataFrame) -> None:
 def add_legend(
     figure: Figure, panels: Iterable[Axes], looks: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Each policy that is drawn once, below the panels, in the order of ``looks``."""
+    """Add a legend below the panels, each policy once, in the order of ``looks``."""
     shown: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()

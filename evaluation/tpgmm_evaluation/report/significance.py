@@ -13,13 +13,19 @@ from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "LEVEL", "PAIR", "PLACE", "REFERENCE", "holm", "mcnemar", "over_tasks", "paired", "verdict",
+    "LEVEL", "PAIR", "PLACE", "REFERENCE", "compare_over_tasks", "compare_pairs", "holm",
+    "mcnemar", "verdict",
 ]  # fmt: skip
 
 #: The policy with which the others are compared.
 REFERENCE = "tpgmm"
 #: Corrected p-values below it are called significant.
 LEVEL = 0.05
+#: What is counted of a comparison, as :func:`compare_pairs` describes it.
+COUNTS = [
+    *("pairs", "successes", "other_successes", "only_reference", "only_other"),
+    *("seeds_better", "seeds_worse", "seeds"),
+]
 #: Draws of tasks for an interval over tasks.
 DRAWS = 10_000
 #: What one comparison is about, and what makes two episodes a pair.
@@ -27,7 +33,7 @@ PLACE, PAIR = ["env", "demonstrations", "condition"], ["training_seed", "evaluat
 
 
 def mcnemar(only_one: int, only_other: int) -> float:
-    """Exact p-value, two-sided, of McNemar's test on pairs (Psychometrika 12, 1947).
+    """Compute the exact p-value of McNemar's test, two-sided (Psychometrika 12, 1947).
 
     Pairs in which both succeed or both fail say nothing. Of the others, either is as likely to
     be the one that succeeds if neither is better: a sign test.
@@ -55,7 +61,7 @@ def mcnemar(only_one: int, only_other: int) -> float:
 
 
 def holm(p_values: Sequence[float]) -> NDArray[np.float64]:
-    """P-values corrected for how many there are (Holm, Scand. J. Statist. 6, 1979).
+    """Correct p-values for how many there are (Holm, Scand. J. Statist. 6, 1979).
 
     The probability that one or more of them are below a level though there is nothing to be
     found is at most that level, however they depend on one another.
@@ -83,8 +89,8 @@ def holm(p_values: Sequence[float]) -> NDArray[np.float64]:
     return result
 
 
-def paired(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
-    """Every other policy beside the reference, wherever both were evaluated.
+def compare_pairs(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
+    """Compare every other policy with the reference, wherever both were evaluated.
 
     Parameters
     ----------
@@ -113,23 +119,13 @@ def paired(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
                 continue
             gain = both.success.astype(int) - both.success_other.astype(int)
             by_seed = gain.groupby(both.training_seed).sum()
-            rows.append(
-                dict(zip(PLACE, place, strict=True))
-                | {
-                    "policy": policy,
-                    "pairs": len(both),
-                    "successes": int(both.success.sum()),
-                    "other_successes": int(both.success_other.sum()),
-                    "only_reference": int((gain > 0).sum()),
-                    "only_other": int((gain < 0).sum()),
-                    "seeds_better": int((by_seed > 0).sum()),
-                    "seeds_worse": int((by_seed < 0).sum()),
-                    "seeds": len(by_seed),
-                }
+            figures = (
+                *(len(both), int(both.success.sum()), int(both.success_other.sum())),
+                *(int((gain > 0).sum()), int((gain < 0).sum())),
+                *(int((by_seed > 0).sum()), int((by_seed < 0).sum()), len(by_seed)),
             )
-    columns = [*PLACE, "policy", "pairs", "successes", "other_successes", "only_reference"]
-    columns += ["only_other", "seeds_better", "seeds_worse", "seeds"]
-    table = pd.DataFrame(rows, columns=columns)
+            rows.append((*place, policy, *figures))
+    table = pd.DataFrame(rows, columns=[*PLACE, "policy", *COUNTS])
     counts = list(zip(table.only_reference, table.only_other, strict=True))
     table["p"] = np.array([mcnemar(*pair) for pair in counts], dtype=float)
     table["p_holm"] = table.p
@@ -139,13 +135,13 @@ def paired(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
     return table
 
 
-def over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
-    """Every other policy beside the reference, over many tasks that count alike.
+def compare_over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFrame:
+    """Compare every other policy with the reference, over many tasks that count alike.
 
     Parameters
     ----------
     episodes : DataFrame
-        As of :func:`paired`; those of one condition.
+        As of :func:`compare_pairs`; those of one condition.
     reference : str
         The policy that stands on one side of all comparisons.
 
@@ -153,14 +149,14 @@ def over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFra
     -------
     DataFrame
         A row for each other ``policy`` and number of ``demonstrations``, of the pairs of
-        episodes that :func:`paired` compares. ``differences``: a Series over tasks, the
+        episodes that :func:`compare_pairs` compares. ``differences``: a Series over tasks, the
         reference's share of successes less the other's; ``success`` and ``other_success``: the
         means over tasks; ``difference``: of them, with the 95 % interval of other tasks like
         these, ``low`` and ``high`` (percentiles of 10,000 draws of tasks); ``p``: of Wilcoxon's
         signed-rank test over tasks (Biometrics Bulletin 1, 1945), not corrected.
     """
     rows = []
-    for (policy, count), part in paired(episodes, reference).groupby(
+    for (policy, count), part in compare_pairs(episodes, reference).groupby(
         ["policy", "demonstrations"], sort=True
     ):
         part = part.set_index("env")
@@ -182,13 +178,11 @@ def over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFra
                 "p": wilcoxon(apart).pvalue if len(apart) else 1.0,
             }
         )
-    columns = ["policy", "demonstrations", "differences", "success", "other_success"]
-    columns += ["difference", "low", "high", "p"]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows)
 
 
 def verdict(only_reference: int, only_other: int, p: float) -> str:
-    """Verdict of a comparison on the reference.
+    """Judge the reference in a comparison.
 
     Parameters
     ----------

@@ -14,14 +14,14 @@ from scipy.stats import binomtest
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["cell_table", "demonstration_table", "episode_table", "wilson", "write_table"]
+__all__ = ["cell_table", "count_demonstrations", "episode_table", "wilson", "write_table"]
 
 #: What identifies a cell, in the order of the columns.
 KEYS = ("env", "policy", "demonstrations", "seed", "condition")
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Score interval of a proportion (Wilson, JASA 22, 1927).
+    """Compute the score interval of a proportion (Wilson, JASA 22, 1927).
 
     Unlike the normal approximation it stays within [0, 1] and is not empty where all trials
     succeed or none.
@@ -38,7 +38,7 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
 
 
 def cell_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row for each cell, from what :class:`Results` holds.
+    """Tabulate cells in a row each, from what :class:`Results` holds.
 
     It has what identifies the cell; ``success`` with its 95 % interval of Wilson; median and
     95th percentile of each figure of the environment; latency, training, size, options,
@@ -51,29 +51,35 @@ def _row(result: Mapping[str, Any]) -> dict[str, Any]:
     episodes, training = result["episodes"], result["training"]
     successes = sum(episode["success"] for episode in episodes)
     low, high = wilson(successes, len(episodes))
-    row = {key: result["cell"][key] for key in KEYS}
-    row |= {
+    return {
+        **{key: result["cell"][key] for key in KEYS},
         "episodes": len(episodes),
         "successes": successes,
         "success": successes / len(episodes),
         "success_low": low,
         "success_high": high,
+        **_spreads(pd.DataFrame(episodes)),
+        **result["latency"],
+        "training_seconds": training["seconds"],
+        "training_outcome": training["outcome"],
+        **{key: training[key] for key in ("fps", "parameters", "bytes")},
+        "evaluation_seconds": result["evaluation_seconds"],
+        # 0.1.0 did not take it
+        "evaluation_cpu_seconds": result.get("evaluation_cpu_seconds", float("nan")),
+        "first_evaluation_seed": episodes[0]["seed"],
+        **{key: _text(result["settings"][key]) for key in ("options", "demonstration_seed")},
+        **{key: _text(result[key]) for key in ("versions", "machine")},
     }
-    for key in (name for name in episodes[0] if name not in ("seed", "success")):
-        values = [episode[key] for episode in episodes]
-        row[f"{key}_median"] = float(np.median(values))
+
+
+def _spreads(episodes: pd.DataFrame) -> dict[str, float]:
+    """Compute median and 95th percentile of each figure of episodes."""
+    found = {}
+    for key, values in episodes.drop(columns=["seed", "success"]).items():
+        found[f"{key}_median"] = float(np.median(values))
         # not interpolated: a figure may be infinite
-        row[f"{key}_p95"] = float(np.percentile(values, 95, method="higher"))
-    row |= result["latency"]
-    row |= {f"training_{key}": training[key] for key in ("seconds", "outcome")}
-    row |= {key: training[key] for key in ("fps", "parameters", "bytes")}
-    row["evaluation_seconds"] = result["evaluation_seconds"]
-    # 0.1.0 did not take it
-    row["evaluation_cpu_seconds"] = result.get("evaluation_cpu_seconds", float("nan"))
-    row["first_evaluation_seed"] = episodes[0]["seed"]
-    for key in ("options", "demonstration_seed"):
-        row[key] = _text(result["settings"][key])
-    return row | {key: _text(result[key]) for key in ("versions", "machine")}
+        found[f"{key}_p95"] = float(np.percentile(values, 95, method="higher"))
+    return found
 
 
 def _text(value: Any) -> Any:
@@ -81,7 +87,7 @@ def _text(value: Any) -> Any:
 
 
 def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row for each evaluation episode, from what :class:`Results` holds.
+    """Tabulate evaluation episodes in a row each, from what :class:`Results` holds.
 
     It has what identifies the cell (the seed of its training as ``training_seed``), the seed of
     its demonstrations, the seed of the episode (``evaluation_seed``), what the episode gave,
@@ -103,8 +109,8 @@ def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     return table[[key for key in table if key != "versions"] + ["versions"] * bool(rows)]
 
 
-def demonstration_table(folder: Path) -> pd.DataFrame:
-    """How many attempts at demonstrations succeed by the environment's own criteria.
+def count_demonstrations(folder: Path) -> pd.DataFrame:
+    """Count attempts at demonstrations that succeed by the environment's own criteria.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tpgmm_evaluation.faults.drawing import HALVES, Fault, Run
-from tpgmm_evaluation.faults.measures import measured
+from tpgmm_evaluation.faults.measures import measure_runs
 from tpgmm_evaluation.faults.servos import Servo
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ CASES = {
 def measures(rate, servo, faults, robot="four joints"):
     """Of one run."""
     run = Run(robot, rate, servo, faults, 0, np.random.default_rng(0))
-    [(_, found)] = measured([run])
+    [(_, found)] = measure_runs([run])
     return found
 
 
@@ -73,7 +73,7 @@ def test_a_stopped_robot_is_not_led_far(lag, begin):
 @pytest.mark.parametrize("robot", ["four joints", "gripper"])
 def test_whatever_is_drawn_references_keep_bounds_and_the_status_is_true(robot):
     """A few of those that ``python -m tpgmm_evaluation.faults`` draws."""
-    found = measured([Run.draw(HALVES[0], seed, [50.0], [robot]) for seed in range(10)])
+    found = measure_runs([Run.draw(HALVES[0], seed, [50.0], [robot]) for seed in range(10)])
     for run, one in found:
         assert {name: one[name] for name in BOUNDS} == dict.fromkeys(BOUNDS, 0), str(run)
         assert not one["open"], str(run)

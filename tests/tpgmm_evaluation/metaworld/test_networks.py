@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from tests.support.reaching import reaching
-from tpgmm_evaluation.metaworld.__main__ import settings_of
-from tpgmm_evaluation.metaworld.learners import LEARNERS
+from tpgmm_evaluation.metaworld.learners import LEARNERS, settings_of
 from tpgmm_evaluation.metaworld.networks import Perceptron, features
 
 pytestmark = pytest.mark.slow

@@ -13,13 +13,12 @@ from lerobot_env_bimanual.metaworld.tasks import TASKS, TUNED, difficulty
 from tests.support.reaching import reaching
 from tpgmm_evaluation.cells import Cell, Results
 from tpgmm_evaluation.metaworld import recordings
-from tpgmm_evaluation.metaworld import summary as summaries
 from tpgmm_evaluation.metaworld.__main__ import report
 from tpgmm_evaluation.metaworld.learners import (
     LEARNERS,
     TaskParameterized,
-    direct,
-    paced,
+    drop_slow,
+    slow_down,
     switches,
 )
 from tpgmm_evaluation.metaworld.nearness import Nearness
@@ -36,7 +35,7 @@ from tpgmm_evaluation.metaworld.summary import (
     LOOKS,
     comparison_table,
     cost_table,
-    draw_groups,
+    panels,
     summary,
     task_table,
 )
@@ -57,26 +56,34 @@ def cell(task, n, solved, of=4, seed=0, policy="tpgmm", seconds=2.0, outcome="do
     }
 
 
+def episodes_of(cells):
+    rest = {"settings": {"demonstration_seed": 0}, "versions": {}}
+    return episode_table([one | rest for one in cells])
+
+
 def test_groups_are_all_tasks_and_two_halves_that_share_none():
     assert set(GROUPS["tuned half"]).isdisjoint(GROUPS["held half"])
     assert sorted((*GROUPS["tuned half"], *GROUPS["held half"])) == list(TASKS)
+    assert set(LOOKS) == set(LEARNERS)
 
 
 def test_the_summary_has_means_over_tasks_with_intervals_and_every_seed():
     results = [cell("push-v3", 3, 4), cell("reach-v3", 3, 2), cell("push-v3", 3, 2, seed=1)]
-    rows = {row.split("|")[1].strip(): row for row in summary(results).splitlines()}
+    rows = {
+        row.split("|")[1].strip(): row for row in summary(episodes_of(results)).splitlines()
+    }
     # push 6 of 8, reach 2 of 4: (75 + 50) / 2; the interval is that of 7.5 of 12, rounded.
     # Seed 1 was tried in one task only
     assert "| 62.5 (39 to 86), in 2 of 50 |" in rows["all (50)"]
     assert "| 75.0 (41 to 93) [100, 50], in 1 of 6 |" in rows["hard (6)"]
     assert "medium (11)" not in rows
     whole = [cell(task, 3, i % 3 + 1, seed=s) for s in (0, 1) for i, task in enumerate(TASKS)]
-    assert "[50, 50] |" in summary(whole).splitlines()[2]
+    assert "[50, 50] |" in summary(episodes_of(whole)).splitlines()[2]
 
 
 def test_tables_put_tpgmm_first_and_leave_room_where_nothing_was_measured():
     results = [cell("push-v3", 1, 1, policy="perceptron"), cell("reach-v3", 3, 2)]
-    heading, _, push, reach = task_table(results).splitlines()
+    heading, _, push, reach = task_table(episodes_of(results)).splitlines()
     assert heading == "| task |  | tpgmm, 3 | perceptron, 1 |"
     assert push.endswith("|  | 1/4 |")
     assert reach.endswith("| 2/4 |  |")
@@ -109,15 +116,6 @@ def test_a_report_is_written_of_all_cells_that_are_there(tmp_path):
     assert table["success"].sum() == 6
 
 
-def test_every_learner_has_a_line_in_the_picture():
-    assert set(LOOKS) == set(LEARNERS)
-
-
-def episodes_of(cells):
-    rest = {"settings": {"demonstration_seed": 0}, "versions": {}}
-    return episode_table([one | rest for one in cells])
-
-
 def test_policies_are_compared_over_the_tasks_that_both_were_tried_in():
     ours = {"push-v3": 4, "reach-v3": 2, "sweep-v3": 1, "soccer-v3": 3}
     theirs = {"push-v3": 1, "reach-v3": 3, "sweep-v3": 1, "hammer-v3": 4}
@@ -135,15 +133,11 @@ def test_policies_are_compared_over_the_tasks_that_both_were_tried_in():
     assert comparison_table(episodes_of([cell("push-v3", 3, 1)])) == ""
 
 
-def test_a_picture_leaves_out_who_was_tried_in_fewer_tasks(monkeypatch):
-    drawn = []
-    monkeypatch.setattr(summaries, "success_panels", lambda episodes, _: drawn.append(episodes))
-    monkeypatch.setattr(summaries, "write", lambda figure, path: None)
+def test_a_picture_leaves_out_who_was_tried_in_fewer_tasks():
     pair = [task for task in TASKS if difficulty(task) == "hard"][:2]
     cells = [cell(task, 3, 1, policy=policy) for task in pair for policy in ("tpgmm", "act")]
     cells += [cell(pair[0], 3, 1, seed=1), cell(pair[0], 3, 1, policy="diffusion")]
-    draw_groups(episodes_of(cells), None)
-    [shown] = drawn
+    shown = panels(episodes_of(cells))
     assert {"all", "hard"} <= set(shown.env) <= set(GROUPS)
     assert set(shown[shown.env == "all"].policy) == {"tpgmm", "act"}
     assert set(shown[shown.env == "all"].training_seed) == {0}
@@ -167,12 +161,9 @@ def test_episodes_are_read_back_as_they_were(tmp_path):
         assert (found.seed, found.success) == (was.seed, was.success)
         for name in ("observed", "references", "actions"):
             assert np.array_equal(getattr(found, name), getattr(was, name))
-
-
-def test_a_damaged_file_says_so(tmp_path):
-    (tmp_path / "push.npz").write_bytes(b"nothing")
+    (tmp_path / "damaged.npz").write_bytes(b"nothing")
     with pytest.raises(DataError, match="delete it"):
-        read(tmp_path / "push.npz")
+        read(tmp_path / "damaged.npz")
 
 
 def test_too_few_successes_are_refused():
@@ -203,13 +194,13 @@ def test_the_expert_is_asked_for_more_where_it_fails(
 
     monkeypatch.setattr(recordings, "record_metaworld", record)
     monkeypatch.setattr(recordings, "MetaworldStateEnv", Mock())
-    episodes = recordings.recorded(tmp_path, "push-v3", 0, n, least)
+    episodes = recordings.record_expert(tmp_path, "push-v3", 0, n, least)
     assert [episode.seed for episode in episodes] == said == [*range(asked)]
     # a second run asks for nothing, and one that needs fewer has the first of them
-    again = recordings.recorded(tmp_path, "push-v3", 0, n, least)
+    again = recordings.record_expert(tmp_path, "push-v3", 0, n, least)
     assert [episode.seed for episode in again] == [*range(asked)] == said
     if any(episode.success for episode in episodes):
-        assert len(recordings.recorded(tmp_path, "push-v3", 0, 1, 2)) == 2
+        assert len(recordings.record_expert(tmp_path, "push-v3", 0, 1, 2)) == 2
 
 
 def test_switches_are_where_the_gripper_jumps():
@@ -219,15 +210,15 @@ def test_switches_are_where_the_gripper_jumps():
 def test_events_are_the_switches_that_all_demonstrations_have():
     once, twice = reaching(0), reaching(1)
     twice.references[50:, -1] = 1.0
-    first, second = paced([once, twice], 1.0)
+    first, second = slow_down([once, twice], 1.0)
     assert first.events == second.events == {"switch 1": pytest.approx(30 / 80)}
     once.references[30:, -1] = 1.0  # never closed: nothing is common
-    assert not any(one.events for one in paced([once, twice], 0.5))
+    assert not any(one.events for one in slow_down([once, twice], 0.5))
 
 
 def test_fingers_are_told_later_where_the_hand_is_slower():
     shown = reaching(0)
-    [one] = paced([shown], 0.5)
+    [one] = slow_down([shown], 0.5)
     assert float(one.time[-1]) == pytest.approx(59 / 80 / 0.5)
     # the hand takes twice as long to where it was 0.19 s after the switch, fingers do not
     assert one.events["switch 1"] == pytest.approx(2 * 30 / 80 + 0.19, abs=0.5 / 80 / 0.5)
@@ -237,9 +228,9 @@ def test_fingers_are_told_later_where_the_hand_is_slower():
 
 def test_second_tries_are_not_learned_from():
     episodes = [reaching(seed, length) for seed, length in enumerate((80, 60, 84, 85, 60))]
-    assert direct(episodes, longest=1.4) == [episodes[i] for i in (0, 1, 2, 4)]
-    assert direct(episodes, longest=1.3) == [episodes[i] for i in (1, 4)]
-    assert direct(episodes[:1], longest=1.4) == episodes[:1]
+    assert drop_slow(episodes, longest=1.4) == [episodes[i] for i in (0, 1, 2, 4)]
+    assert drop_slow(episodes, longest=1.3) == [episodes[i] for i in (1, 4)]
+    assert drop_slow(episodes[:1], longest=1.4) == episodes[:1]
     learner = TaskParameterized()
     few, all_of_them = (learner.fit(some, 0).policy for some in (episodes[:3], episodes[:4]))
     most = replace(learner, longest=2.0).fit(episodes[:4], 0).policy
@@ -254,7 +245,7 @@ def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
     for step in (1, 40, 41, 58, 59):
         shown.references[step:, -1] = 1 - shown.references[step:, -1]
     assert switches(shown.references) == [1, 30, 40, 41, 58, 59]
-    [one] = paced([shown], 1.0)
+    [one] = slow_down([shown], 1.0)
     assert [round(80 * instant) for instant in one.events.values()] == [30, 40]
     TaskParameterized().fit([shown], 0)
 
@@ -271,7 +262,7 @@ def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
     for warping, largest in (({}, 0.015), ({"max_slope": 1}, 0.04)):
         learner = TaskParameterized()
         learner = replace(learner, warping=learner.warping | warping)
-        aligned = learner._aligned(paced(shown, learner.pace), metaworld_robot())
+        aligned = learner.align(slow_down(shown, learner.pace), metaworld_robot())
         heights = torch.stack([one.joints[:, 2] for one in aligned])
         assert largest / 3 < float(heights.std(0).mean()) < largest
 
@@ -282,7 +273,7 @@ def test_the_prior_is_what_its_formula_says_and_parts_the_gripper_from_the_hand(
     shown = with_holds([reaching(seed).demonstration() for seed in range(3)], ())
     model = TaskParameterizedGMM(5, metaworld_operators(["goal"]), metaworld_robot())
     before = model.fit(shown).skill
-    after = prior.applied(before, 3)
+    after = prior.apply(before, 3)
     (joints, new), (seen, near) = zip(before.conditionals, after.conditionals, strict=True)
     deviation = prior.deviation(seen.mean.norm(dim=1))[:, None].expand(-1, 3)
     torch.testing.assert_close(

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from tpgmm_evaluation.metaworld.trials import trials
+from tpgmm_evaluation.metaworld.trials import try_out
 
 
 class Hall:
@@ -45,7 +45,7 @@ def busy(seconds):
 
 def test_an_episode_ends_with_success_or_rest_and_says_what_acting_took():
     env = Hall()
-    first, second, third = trials(env, Walker(), [1, 3, 0])
+    first, second, third = try_out(env, Walker(), [1, 3, 0])
     assert env.control == "displacement"
     assert [first["success"], second["success"], third["success"]] == [True, True, False]
     assert [first["steps"], second["steps"], third["steps"]] == [4, 2, 40]

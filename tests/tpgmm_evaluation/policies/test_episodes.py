@@ -13,7 +13,7 @@ from tpgmm_torch.exceptions import DataError
 FPS = 20
 
 
-def numbered(*lengths):
+def number_rows(*lengths):
     """Episodes whose values tell where they come from: 100 times the episode, plus the row."""
     parts = []
     for number, length in enumerate(lengths):
@@ -22,7 +22,7 @@ def numbered(*lengths):
     return Episodes.join(FPS, parts)
 
 
-def windowed(episodes, *arguments):
+def cut_windows(episodes, *arguments):
     return Windows(episodes.columns, episodes.bounds, *arguments)
 
 
@@ -52,7 +52,7 @@ def test_episodes_are_read_as_they_were_written(tmp_path):
 
 
 def test_windows_stay_in_their_episode_at_the_lower_rate():
-    windows = windowed(numbered(8, 6), 2, [-1, 0], [0, 1, 2])
+    windows = cut_windows(number_rows(8, 6), 2, [-1, 0], [0, 1, 2])
     assert len(windows) == 14
     batch = windows.at(torch.tensor([0, 5, 8, 11]))
     # two steps, of two rows each, are seen
@@ -75,7 +75,7 @@ def test_windows_stay_in_their_episode_at_the_lower_rate():
 
 
 def test_without_a_history_observations_have_no_time_axis():
-    batch = windowed(numbered(8), 4, None, [0]).at(torch.tensor([3]))
+    batch = cut_windows(number_rows(8), 4, None, [0]).at(torch.tensor([3]))
     assert batch[OBS_STATE].shape == (1, 1)
     assert batch[ACTION].tolist() == [[[6.5]]]
 
@@ -99,6 +99,6 @@ def test_the_common_clock_removes_differences_in_time():
     assert [float(rows[0, 0]) for _, rows, _ in training] == pytest.approx([1.0, 1.1, 0.9])
     state, action = training.columns[OBS_STATE], training.columns[ACTION]
     torch.testing.assert_close(action, state + 0.01, atol=1e-5, rtol=0)
-    assert training.elapsed()[: max(lengths)].tolist() == pytest.approx(
+    assert training.elapsed_time()[: max(lengths)].tolist() == pytest.approx(
         [i / FPS for i in range(max(lengths))]
     )

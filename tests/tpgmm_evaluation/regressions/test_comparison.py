@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from tpgmm_evaluation.regressions.comparison import compared, stored, table
+from tpgmm_evaluation.regressions.comparison import compare_cells, read_pairs, table
 
 
-def judged(kind, before, now, cells=1, name="x"):
+def verdict(kind, before, now, cells=1, name="x"):
     """Why something is worse; the first cell differs, others are equal."""
     one = {f"{kind}:{name}": np.array(before, dtype=float)}
     other = {f"{kind}:{name}": np.array(now, dtype=float)}
-    [row] = compared([("group", one, other), *[("group", one, one)] * (cells - 1)])
+    [row] = compare_cells([("group", one, other), *[("group", one, one)] * (cells - 1)])
     return row.worse
 
 
@@ -39,11 +39,11 @@ SHARES = np.linspace(0.5, 1.5, 20)
     ],
 )
 def test_what_is_worse(kind, before, now, cells, worse):
-    assert judged(kind, before, now, cells) == worse
+    assert verdict(kind, before, now, cells) == worse
 
 
 def test_a_compiled_step_may_hardly_be_slower():
-    assert judged("seconds", [1.0], [1.2], name="step, compiled") == "1.20 times as long"
+    assert verdict("seconds", [1.0], [1.2], name="step, compiled") == "1.20 times as long"
 
 
 def test_a_cell_that_is_missing_is_worse_and_groups_are_folders(tmp_path):
@@ -52,7 +52,7 @@ def test_a_cell_that_is_missing_is_worse_and_groups_are_folders(tmp_path):
             path = tmp_path / folder / "section" / f"{cell}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(path, **{"success:x": np.ones(3)})
-    found = compared(stored(tmp_path / "before", tmp_path / "now", ["section"]))
+    found = compare_cells(read_pairs(tmp_path / "before", tmp_path / "now", ["section"]))
     assert [row.name for row in found] == ["section/a: x", "section/alone: x"]
     assert [row.n for row in found] == [6, 0]
     assert [bool(row.worse) for row in found] == [False, True]

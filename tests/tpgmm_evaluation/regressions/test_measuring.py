@@ -87,7 +87,7 @@ def test_sections_find_what_they_measure_with(tmp_path):
 def test_rollouts_are_compared_episode_by_episode(tmp_path, monkeypatch):
     def compare(settings, out, policies, counts, *_):
         for n in counts:
-            for cell in (("tpgmm", "nominal"), ("knn", "nominal"), ("tpgmm", "moved")):
+            for cell in (("tpgmm", "nominal"), ("nearest", "nominal"), ("tpgmm", "moved")):
                 found = result(cell[0], n, n, cell[1])
                 Results(out / "bottle_shaking" / "cells").write(Cell(**found["cell"]), found)
         return Comparison(2, {})

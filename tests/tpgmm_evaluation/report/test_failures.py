@@ -9,8 +9,8 @@ from tpgmm_evaluation.benchmarks import benchmark
 from tpgmm_evaluation.report.failures import (
     criterion,
     evaluation_command,
-    failed_episodes,
-    missed,
+    list_failures,
+    missed_criteria,
 )
 from tpgmm_evaluation.report.tables import episode_table
 from tpgmm_evaluation.settings import Settings
@@ -41,15 +41,15 @@ def test_criteria_are_told_with_their_bound(where, key, text):
 
 @pytest.mark.parametrize("key", GOOD)
 def test_each_criterion_alone_is_missed(key):
-    assert missed(GOOD, BOTTLE) == []
+    assert missed_criteria(GOOD, BOTTLE) == []
     bad = 0.0 if key == "lift_mm" else 99.0
     for figures in (GOOD | {key: bad}, GOOD | {key: math.nan}, GOOD | {key: math.inf}):
         expected = [] if key == "lift_mm" and figures[key] == math.inf else [key]
-        assert missed(figures, BOTTLE) == expected
-    assert missed({k: v for k, v in GOOD.items() if k != key}, BOTTLE) == [key]
+        assert missed_criteria(figures, BOTTLE) == expected
+    assert missed_criteria({k: v for k, v in GOOD.items() if k != key}, BOTTLE) == [key]
 
 
-def test_failed_episodes_are_listed_with_what_was_missed():
+def test_list_failures_are_listed_with_what_was_missed():
     bottle = result("tpgmm", 5, 18, seed=3)
     for episode in bottle["episodes"]:
         episode["amplitude_error"] = 0.1
@@ -58,7 +58,7 @@ def test_failed_episodes_are_listed_with_what_was_missed():
     aloha = result("tpgmm", 5, 20, env="aloha_state")
     aloha["episodes"] = [{"seed": 7, "success": False, "max_reward": 2.0, "lift_mm": 3.0}]
     benchmarks = {"bottle_shaking": BOTTLE, "aloha_state": ALOHA}
-    table = failed_episodes(episode_table([bottle, late, aloha]), benchmarks)
+    table = list_failures(episode_table([bottle, late, aloha]), benchmarks)
     assert list(table.evaluation_seed) == [118, 119, 5, 7]
     assert list(table.training_seed) == [3, 3, 0, 0]
     assert list(table.missed) == [
@@ -66,7 +66,7 @@ def test_failed_episodes_are_listed_with_what_was_missed():
         "all of them are met, but not in time",
         "stage, 0 to 4: 2; lift [mm]: 3",
     ]
-    assert failed_episodes(episode_table([result("tpgmm", 5, 20)]), benchmarks).empty
+    assert list_failures(episode_table([result("tpgmm", 5, 20)]), benchmarks).empty
 
 
 def test_an_episode_is_run_again_by_lerobot():

@@ -9,10 +9,10 @@ from scipy.stats import binom
 
 from tests.support.comparison import result
 from tpgmm_evaluation.report.significance import (
+    compare_over_tasks,
+    compare_pairs,
     holm,
     mcnemar,
-    over_tasks,
-    paired,
     verdict,
 )
 from tpgmm_evaluation.report.tables import episode_table
@@ -42,8 +42,6 @@ def test_mcnemar_is_twice_the_smaller_tail(one, other):
     assert mcnemar(one, other) == pytest.approx(min(1.0, tail))
     assert mcnemar(one, other) == mcnemar(other, one)
 
-
-def test_mcnemar_refuses_what_are_no_counts():
     with pytest.raises(DataError, match="-1 and 2 are no numbers"):
         mcnemar(-1, 2)
 
@@ -80,7 +78,7 @@ def test_episodes_are_paired_by_training_seed_and_evaluation_seed():
         result("act", 10, 20),
         result("nearest", 5, [], seed=1),
     ]
-    table = paired(episode_table(results)).set_index("policy")
+    table = compare_pairs(episode_table(results)).set_index("policy")
     assert list(table.index) == ["act", "nearest"]
     act = table.loc["act"]
     assert (act.pairs, act.successes, act.other_successes) == (40, 5, 5)
@@ -98,14 +96,14 @@ def test_conditions_are_corrected_apart_from_what_is_nominal():
         result("tpgmm", 5, 0, condition="pushes"),
         result("act", 5, 7, condition="pushes"),
     ]
-    table = paired(episode_table(results))
+    table = compare_pairs(episode_table(results))
     np.testing.assert_allclose(table.p, [2 / 2**7, 2 / 2**8, 2 / 2**7])
     np.testing.assert_allclose(table.p_holm, [2 / 2**7, 2 * 2 / 2**8, 2 / 2**7])
     assert list(table.verdict) == ["better", "better", "worse"]
 
 
 def test_without_others_there_is_nothing_to_compare():
-    table = paired(episode_table([result("tpgmm", 5, 20)]))
+    table = compare_pairs(episode_table([result("tpgmm", 5, 20)]))
     assert table.empty and {"p_holm", "verdict", "env"} <= set(table)
     assert isinstance(table, pd.DataFrame)
 
@@ -130,7 +128,7 @@ def test_tasks_count_alike_however_many_pairs_they_have():
     for env, one, other in zip("abcde", ours, theirs, strict=True):
         results += [result("tpgmm", 5, one, env=env), result("act", 5, other, env=env)]
     results += [result(policy, 5, 20, seed=1, env="a") for policy in ("tpgmm", "act")]
-    [row] = over_tasks(episode_table(results)).itertuples()
+    [row] = compare_over_tasks(episode_table(results)).itertuples()
     # a: 40 of 40 beside 25
     assert row.differences.to_dict() == {"a": 0.375, "b": 0.5, "c": 0, "d": 0.75, "e": -0.25}
     assert row.difference == pytest.approx(row.success - row.other_success)
@@ -139,8 +137,7 @@ def test_tasks_count_alike_however_many_pairs_they_have():
     # of 0.25, 0.375, 0.5 and 0.75 the first is negative: 2 of 16 signs are no less one-sided
     assert row.p == pytest.approx(2 * 2 / 16)
 
-
-def test_policies_that_are_level_in_all_tasks_are_not_told_apart():
+    # level in all tasks
     results = [result(policy, 5, 9, env=env) for env in "ab" for policy in ("tpgmm", "act")]
-    [row] = over_tasks(episode_table(results)).itertuples()
+    [row] = compare_over_tasks(episode_table(results)).itertuples()
     assert (row.difference, row.low, row.high, row.p) == (0, 0, 0, 1)

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.comparison import DISTURBED, RESULTS, result
 from tpgmm_evaluation.cells import Cell
-from tpgmm_evaluation.report.significance import paired
+from tpgmm_evaluation.report.significance import compare_pairs
 from tpgmm_evaluation.report.summary import Task, best_others, write_summary
 from tpgmm_evaluation.report.tables import episode_table
 from tpgmm_evaluation.settings import Settings
@@ -180,5 +180,5 @@ def test_the_best_of_the_others_is_no_tpgmm_and_among_equals_the_hardest():
         put("act", 10, range(4, 16)),
         put("diffusion", 10, 3),
     ]
-    [best] = best_others(paired(episode_table(results))).itertuples()
+    [best] = best_others(compare_pairs(episode_table(results))).itertuples()
     assert (best.policy, best.only_other, best.only_reference) == ("act", 2, 0)

@@ -9,7 +9,7 @@ import pytest
 from tests.support.comparison import RESULTS, result
 from tpgmm_evaluation.report.tables import (
     cell_table,
-    demonstration_table,
+    count_demonstrations,
     episode_table,
     wilson,
     write_table,
@@ -77,6 +77,6 @@ def test_demonstrations_are_counted_by_seed(tmp_path):
         folder = tmp_path / "episodes" / f"s{seed}"
         folder.mkdir(parents=True)
         (folder / "summary.json").write_text(json.dumps({"successes": successes}))
-    table = demonstration_table(tmp_path)
+    table = count_demonstrations(tmp_path)
     assert table.to_dict("list") == {"seed": [2, 10], "tried": [1, 2], "succeed": [1, 1]}
-    assert demonstration_table(tmp_path / "none").empty
+    assert count_demonstrations(tmp_path / "none").empty
