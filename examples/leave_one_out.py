@@ -130,7 +130,7 @@ def pose(link: str, frame: str | None = None) -> Stack:
 def pouring(demonstration: Demonstration) -> float:
     """When the right hand is turned furthest away from its start [s]."""
     names = [f"right.{part}" for part in ("qw", "qx", "qy", "qz")]
-    turn = demonstration.reordered(names).joints
+    turn = demonstration.reorder(names).joints
     return float(demonstration.time[int((turn @ turn[0]).abs().argmin())])
 
 

@@ -188,7 +188,7 @@ def find_stops(
     Hogan, Sternad: On rhythmic and discrete movements: reflections, definitions and
     implications for motor control, Experimental Brain Research 181 (2007).
     """
-    time, speed = as_array(demonstration.time), _speed(demonstration, robot)
+    time, speed = as_array(demonstration.time), _robot_speed(demonstration, robot)
     peak = float(np.quantile(speed, 0.98))
     if peak <= 0:
         return []
@@ -218,11 +218,11 @@ def _crossing(time: Array, speed: Array, below: int, way: int, limit: float) -> 
     return float(np.interp(limit, speed[pair], time[pair]))
 
 
-def _speed(demonstration: Demonstration, robot: Any) -> Array:
+def _robot_speed(demonstration: Demonstration, robot: Any) -> Array:
     """Of all links together, of the joints but for grippers without links, smoothed, (T,)."""
     time, names = as_array(demonstration.time), demonstration.joint_names or ()
     if robot is not None and robot.links:
-        state = robot.state(demonstration.reordered(robot.joint_names).joints)
+        state = robot.state(demonstration.reorder(robot.joint_names).joints)
         columns = [as_array(state.position(link)) for link in robot.links]
         if getattr(robot, "orientation", True):  # tracked points have none
             turns = [quaternions.continuous(state.orientation(link)) for link in robot.links]

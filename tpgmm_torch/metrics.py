@@ -52,7 +52,7 @@ def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
     ShapeError
         If the time grids or the joints differ.
     """
-    wanted = demonstration.reordered(trajectory.joint_names).joints
+    wanted = demonstration.reorder(trajectory.joint_names).joints
     if wanted.shape != trajectory.joints.shape:
         raise ShapeError(
             f"the trajectory has shape {tuple(trajectory.joints.shape)}, "
@@ -138,7 +138,7 @@ def pose_errors(
     if link not in robot.links:
         raise UnknownNameError("link", link, "the robot", robot.links)
     instants = _instants(at, demonstration)
-    shown = demonstration.reordered(robot.joint_names)
+    shown = demonstration.reorder(robot.joint_names)
     found = _state_at(trajectory.time, trajectory.joints, instants, robot)
     wanted = _state_at(shown.time, shown.joints, instants, robot)
     distance = torch.linalg.vector_norm(found.position(link) - wanted.position(link), dim=-1)

@@ -182,7 +182,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         every = state_names, action_names, config.units
         self.joints = JointFeatures(names, *every, self.kinematics, offsets)
         if dataset_meta is not None and isinstance(self.kinematics, Robot):
-            self.kinematics = self.kinematics.unlimited(self.joints.raw)
+            self.kinematics = self.kinematics.drop_limits(self.joints.raw)
         environment = config.env_state_feature
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names

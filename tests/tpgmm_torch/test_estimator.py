@@ -420,7 +420,7 @@ def test_a_demonstration_s_own_time_is_not_taken_along():
     assert torch.equal(found.time, hands().time_)
     assert torch.equal(found.joints, same.joints)
     # the cup moves when it did, and stands still where no more is known
-    cup = cut.frames["cup"].resampled(cut.time, hands().time_)
+    cup = cut.frames["cup"].resample(cut.time, hands().time_)
     [expected] = hands().predict(Situation(cut.joints[0], {"cup": cup}, hands().time_))
     torch.testing.assert_close(found.joints, expected.joints, rtol=0, atol=1e-12)
 

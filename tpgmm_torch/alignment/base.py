@@ -80,7 +80,7 @@ def retime(
     }
     holds = demonstration.holds
     if holds is not None:  # those outside the path shrink to an instant, and are left out
-        holds = tuple(h.retimed(clock) for h in holds if clock(h.begin) < clock(h.end))
+        holds = tuple(h.retime(clock) for h in holds if clock(h.begin) < clock(h.end))
     time = time.to(demonstration.time)
     names = demonstration.joint_names
     wrenches = {
@@ -114,7 +114,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         """Fit, and align the same demonstrations without warping them again."""
         X = check_demonstrations(X)
         self.fit(X, y)
-        return list(map(self._retimed, self._checked(X), self.paths_))
+        return list(map(self._retime, self._check(X), self.paths_))
 
     def transform(self, X: Sequence[Any]) -> list[Any]:
         """Align demonstrations onto the time grid learned by ``fit``.
@@ -140,7 +140,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         self._check_fitted("time_")
         if isinstance(X, Sequence) and X and all(isinstance(item, Situation) for item in X):
             return list(X)
-        return [self._retimed(one, self._path(one)) for one in self._checked(X)]
+        return [self._retime(one, self._path(one)) for one in self._check(X)]
 
     @abc.abstractmethod
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
@@ -156,9 +156,9 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         check_robot(self.robot)
         demonstrations = check_demonstrations(X)
         self.joint_names_ = demonstrations[0].joint_names
-        return self._checked(demonstrations)
+        return self._check(demonstrations)
 
-    def _checked(self, X: Any) -> list[Demonstration]:
+    def _check(self, X: Any) -> list[Demonstration]:
         """Check demonstrations and bring their joints into the order of the first fitted."""
         demonstrations = check_demonstrations(X)
         for index, one in enumerate(demonstrations):
@@ -167,8 +167,8 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
                     f"demonstration {index} has one time step: there is nothing to align"
                 )
         names = self.joint_names_
-        return demonstrations if names is None else [d.reordered(names) for d in demonstrations]
+        return demonstrations if names is None else [d.reorder(names) for d in demonstrations]
 
-    def _retimed(self, demonstration: Demonstration, path: Array) -> Demonstration:
+    def _retime(self, demonstration: Demonstration, path: Array) -> Demonstration:
         blocks = quaternion_columns(demonstration, self.robot)
         return retime(demonstration, path, self.time_, blocks)

@@ -46,7 +46,7 @@ def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[in
             f"the demonstration has {demonstration.n_joints} joints without names, the "
             f"robot has {robot.n_joints}: {robot.joint_names}"
         )
-    demonstration.reordered(robot.joint_names)  # names a joint that is missing
+    demonstration.reorder(robot.joint_names)  # names a joint that is missing
     names = list(demonstration.joint_names or robot.joint_names)
     columns = [names.index(name) for name in robot.joint_names]
     return [columns[start : start + 4] for start in starts]
@@ -170,15 +170,15 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     velocity = _velocity(values, demonstration)
     groups = {"joints": values, "directions": _directions(velocity)}
     if robot is None or not robot.links:
-        return groups | {"speed": _speed(velocity)}
+        return groups | {"speed": _relative_speed(velocity)}
     names = getattr(robot, "joint_names", None)
-    ordered = demonstration if names is None else demonstration.reordered(names)
+    ordered = demonstration if names is None else demonstration.reorder(names)
     state = robot.state(ordered.joints.detach())
     speeds = []
     for link in robot.links:
         position = state.position(link)
         groups[link] = as_array(position)
-        speeds.append(_speed(_velocity(groups[link], demonstration)))
+        speeds.append(_relative_speed(_velocity(groups[link], demonstration)))
         for name, frame in demonstration.frames.items():
             seen = frame.to(position).inverse_transform(position)
             groups[f"{link} in {name}"] = as_array(seen)
@@ -200,7 +200,7 @@ def _varying(deviation: Array, size: Array) -> NDArray[np.bool_]:
     return np.asarray(deviation > np.finfo(np.float64).eps ** 0.5 * size)
 
 
-def _speed(velocity: Array) -> Array:
+def _relative_speed(velocity: Array) -> Array:
     """Speed over its root mean square, which may be zero, shape (T, 1)."""
     speed = np.linalg.norm(velocity, axis=1, keepdims=True)
     usual = np.sqrt((speed**2).mean())

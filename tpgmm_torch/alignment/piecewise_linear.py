@@ -175,7 +175,7 @@ class EventAlignment(LinearTimeNormalization):
         self.instants_ = dict(zip(self.events_, self._instants[1:-1].tolist(), strict=True))
         self._fit_parts(demonstrations)
         self.paths_ = [
-            self._joined(one, [part and part.paths_[i] for part in self.parts_])
+            self._join_parts(one, [part and part.paths_[i] for part in self.parts_])
             for i, one in enumerate(demonstrations)
         ]
         return self
@@ -183,7 +183,7 @@ class EventAlignment(LinearTimeNormalization):
     def _order(self, demonstrations: Sequence[Demonstration]) -> tuple[str, ...]:
         """Names of the anchors, each of which every demonstration has."""
         known = dict.fromkeys(name for one in demonstrations for name in one.events)
-        wanted = self._wanted([name for name in known if name not in ("start", "end")])
+        wanted = self._match_events([name for name in known if name not in ("start", "end")])
         if not wanted:
             raise DataError(
                 "there are no events to align at: find them (find_events, events=... of "
@@ -200,7 +200,7 @@ class EventAlignment(LinearTimeNormalization):
             return tuple(wanted)
         return tuple(sorted(wanted, key=lambda name: _median_phase(name, demonstrations)))
 
-    def _wanted(self, known: list[str]) -> list[str]:
+    def _match_events(self, known: list[str]) -> list[str]:
         """The events to align at: all that are known, or those asked for by name or pattern."""
         if self.events is None:
             return known
@@ -276,9 +276,9 @@ class EventAlignment(LinearTimeNormalization):
             None if part is None else part._path(self._part(demonstration, number))
             for number, part in enumerate(self.parts_)
         ]
-        return self._joined(demonstration, paths)
+        return self._join_parts(demonstration, paths)
 
-    def _joined(self, demonstration: Demonstration, paths: Sequence[Array | None]) -> Array:
+    def _join_parts(self, demonstration: Demonstration, paths: Sequence[Array | None]) -> Array:
         """Instants of the demonstration: warped in parts by ``paths``, stretched elsewhere."""
         grid = self.time_.numpy()
         evenly = grid.copy()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
-__all__ = ["Finding", "Report", "in_columns", "listed"]
+__all__ = ["Finding", "Report", "in_columns", "shorten_list"]
 
 PACKAGE = str(Path(__file__).parents[1])
 
@@ -126,12 +126,12 @@ class Report:
         return self
 
 
-def listed(items: Sequence[str], most: int = 3) -> str:
+def shorten_list(items: Sequence[str], most: int = 3) -> str:
     """The first of some ``items``, ``most`` of them, and how many more there are.
 
     Examples
     --------
-    >>> listed(["a", "b", "c", "d", "e"])
+    >>> shorten_list(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
     shown = ", ".join(items[:most])

@@ -61,7 +61,7 @@ def check_situations(
     novelty = np.min(novelties or [np.zeros(batch)], axis=0)
     unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelty)
     worst = np.unravel_index(int(unlike.argmax()), batch)
-    subject, label = _named(worst, batch)
+    subject, label = _describe_batch(worst, batch)
     joint = int(excess[worst].argmax())
     if excess[*worst, joint] > IMPOSSIBLE:
         findings.append(_unit(kinematics, joint, values[*worst, joint], label))
@@ -73,7 +73,7 @@ def check_situations(
     return Report.of(findings, subject)
 
 
-def _named(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
+def _describe_batch(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
     """Names of the batch, and of one of its situations."""
     if len(batch) == 1 and batch[0] > 1:
         return f"{batch[0]} situations", f"situation {worst[0]}, "

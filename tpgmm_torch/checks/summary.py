@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import EpisodeSummary, PathSummary, differing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST
@@ -291,7 +291,7 @@ class TrainingSummary:
         array of shape (...)
             From 0 on.
         """
-        return _joined(self._distances(joints, frames or {}).values()) / self.limit
+        return _norm(self._distances(joints, frames or {}).values()) / self.limit
 
     def start_frames(
         self, joints: Any, kinematics: Kinematics, given: Collection[str] = ()
@@ -342,7 +342,7 @@ class TrainingSummary:
         """
         distances = self._distances(joints, frames)
         ratios = {key: float(value) / self.limit for key, value in distances.items()}
-        if not _joined(distances.values()) > UNLIKELY * self.limit:
+        if not _norm(distances.values()) > UNLIKELY * self.limit:
             return []
         least = min(UNLIKELY, max(ratios.values()))
         describe = {"start": self._start, "place": self._place, "turn": self._turn}
@@ -444,7 +444,7 @@ def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
         return 1.0
     tried = np.unique(np.linspace(0, n - 1, min(n, MOST_LEFT_OUT)).round().astype(int))
     distances = [
-        _joined(
+        _norm(
             Region.of(np.delete(given, i, axis=0), kind, FEWEST).distance(given[i])
             for kind, given in vectors
             if given.shape[1]
@@ -454,7 +454,7 @@ def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
     return float(np.clip(max(distances), *LIMITS))
 
 
-def _joined(distances: Iterable[Array]) -> Array:
+def _norm(distances: Iterable[Array]) -> Array:
     """The 4-norm of distances that broadcast; NaN does not count.
 
     It is nearly the largest, and more where several are large.
@@ -487,7 +487,7 @@ def _outside(
     odd = [i for i in np.argsort(-excess) if excess[i] > 0]
     places = [f"{names[i]} = {values[i]:.4g}, shown {low[i]:.4g} to {high[i]:.4g}" for i in odd]
     beside = f"beside those shown, at {', '.join(f'{x:.3g}' for x in values)}"
-    return listed(places) or beside, tuple(names[i] for i in odd)
+    return shorten_list(places) or beside, tuple(names[i] for i in odd)
 
 
 def _first_poses(paths: Sequence[PathSummary]) -> Frame:

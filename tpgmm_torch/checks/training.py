@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import LEVER, STILL, Frame
@@ -184,7 +184,7 @@ def in_order(
             raise ShapeError(
                 f"demonstration {index} has {one.n_joints} joints, the robot has {n}: {names}"
             )
-    return [one.reordered(names) for one in demonstrations]
+    return [one.reorder(names) for one in demonstrations]
 
 
 def check(
@@ -217,7 +217,7 @@ def check(
         *unit_findings(episodes, kinematics),
         *_clock(episodes),
         *_freedom(len(episodes), operators, kinematics, correlated),
-        *_carried(operators, kinematics, holds),
+        *_operators_without_effect(operators, kinematics, holds),
     ]
     count = len(episodes)
     return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
@@ -312,7 +312,7 @@ def ranges(
     places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
     bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]
     known = bool(np.isfinite(limits).any())
-    return listed([a + b * known for a, b in zip(places, bounds, strict=True)])
+    return shorten_list([a + b * known for a, b in zip(places, bounds, strict=True)])
 
 
 def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
@@ -359,7 +359,7 @@ def _freedom(
         )
 
 
-def _carried(
+def _operators_without_effect(
     operators: Sequence[Operator], kinematics: Kinematics, holds: Sequence[Hold]
 ) -> Iterator[Finding]:
     """Operators that constrain no joint: the objects they are about never move with a link."""
@@ -377,7 +377,8 @@ def _carried(
         texts = [format_operator(operator) for operator in inactive]
         yield Finding(
             "holds",
-            f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
+            f"no link holds {' and '.join(names)}: {shorten_list(texts)} says nothing of the "
+            "joints",
             "Say who holds what: attach_holds(demonstrations, robot) finds it where poses of "
             "objects are recorded over time; Demonstration(..., holds=[Hold("
             f"{names[0]!r}, LINK, BEGIN, END)]) (--hold {names[0]}@LINK:BEGIN-END) gives it. "

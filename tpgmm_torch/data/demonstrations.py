@@ -29,7 +29,7 @@ FEWEST = 2
 SMOOTHING = 0.2
 
 
-def _checked_time(values: Any) -> Tensor:
+def _check_time(values: Any) -> Tensor:
     time = as_tensor(values, "time")
     if time.ndim != 1 or len(time) == 0:
         raise ShapeError(f"time has shape (T,) with T >= 1, got {tuple(time.shape)}")
@@ -43,7 +43,7 @@ def _checked_time(values: Any) -> Tensor:
     return time
 
 
-def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
+def _check_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
     """Check types and lengths; without ``length``, frames per time step share one."""
     frames = dict(frames or {})
     for name, frame in frames.items():
@@ -61,7 +61,7 @@ def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> d
     return frames
 
 
-def _checked_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
+def _check_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
     """Wrenches by link, each (T, 6)."""
     checked = {}
     for link, values in dict(wrenches).items():
@@ -75,7 +75,7 @@ def _checked_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Ten
     return checked
 
 
-def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
+def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
     names = None if names is None else tuple(names)
     if names is not None and not len(set(names)) == len(names) == count:
         raise ShapeError(f"joint_names needs {count} different names, got {names}")
@@ -123,7 +123,7 @@ class Demonstration:
     ... )
     >>> demonstration
     Demonstration(3 steps, 0.20 s, 2 joints, frames=['cup'], events={})
-    >>> demonstration.reordered(["elbow"]).joints[:, 0].tolist()
+    >>> demonstration.reorder(["elbow"]).joints[:, 0].tolist()
     [1.0, 0.9, 0.7]
     """
 
@@ -136,14 +136,14 @@ class Demonstration:
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        time = _checked_time(self.time)
+        time = _check_time(self.time)
         joints = as_tensor(self.joints, "joints")
         if joints.ndim != 2 or len(joints) != len(time):
             raise ShapeError(
                 f"joints has shape (T, n_joints) with T = {len(time)} as in time, "
                 f"got {tuple(joints.shape)}"
             )
-        names = _checked_names(self.joint_names, joints.shape[1])
+        names = _check_names(self.joint_names, joints.shape[1])
         events = {str(name): float(at) for name, at in dict(self.events).items()}
         for name, at in events.items():
             if not time[0] <= at <= time[-1]:
@@ -151,10 +151,10 @@ class Demonstration:
                     f"event {name!r} at {at} s lies outside the demonstration, "
                     f"{time[0]:.6g} to {time[-1]:.6g} s"
                 )
-        frames = _checked_frames(self.frames, len(time))
+        frames = _check_frames(self.frames, len(time))
         holds = None if self.holds is None else check_holds(self.holds, frames)
         vars(self).update(time=time, joints=joints, frames=frames, joint_names=names)
-        wrenches = _checked_wrenches(self.wrenches, len(time))
+        wrenches = _check_wrenches(self.wrenches, len(time))
         vars(self).update(events=events, holds=holds, wrenches=wrenches)
 
     def __len__(self) -> int:
@@ -216,7 +216,7 @@ class Demonstration:
             wrenches={link: wrench[chosen] for link, wrench in self.wrenches.items()},
         )
 
-    def reordered(self, joint_names: Sequence[str]) -> Demonstration:
+    def reorder(self, joint_names: Sequence[str]) -> Demonstration:
         """The same demonstration with its joint columns in the order of ``joint_names``.
 
         Other columns are left out. Without names, the order is trusted.
@@ -266,7 +266,7 @@ class Situation:
     Examples
     --------
     >>> situation = Situation({"elbow": 1.0, "shoulder": 0.0}, {"cup": Frame([0.4, 0.0, 0.1])})
-    >>> situation.reordered(["shoulder", "elbow"]).joints.tolist()
+    >>> situation.reorder(["shoulder", "elbow"]).joints.tolist()
     [0.0, 1.0]
     """
 
@@ -286,13 +286,13 @@ class Situation:
         if joints.ndim != 1 or not len(joints):
             shape = tuple(joints.shape)
             raise ShapeError(f"the start posture is a number for each joint, got shape {shape}")
-        names = _checked_names(names, len(joints))
+        names = _check_names(names, len(joints))
         times = {
-            name: None if value is None else _checked_time(value)
+            name: None if value is None else _check_time(value)
             for name, value in (("time", self.time), ("frames_time", self.frames_time))
         }
         recorded = times["time"] if self.frames_time is None else times["frames_time"]
-        frames = _checked_frames(self.frames, None if recorded is None else len(recorded))
+        frames = _check_frames(self.frames, None if recorded is None else len(recorded))
         vars(self).update(joints=joints, frames=frames, joint_names=names, **times)
 
     @classmethod
@@ -315,7 +315,7 @@ class Situation:
             demonstration.time,
         )
 
-    def reordered(self, joint_names: Sequence[str]) -> Situation:
+    def reorder(self, joint_names: Sequence[str]) -> Situation:
         """The same situation with its joints in the order of ``joint_names``.
 
         Other joints are left out. Without names, the order is trusted.
@@ -350,10 +350,10 @@ class Situation:
         """
         recorded = self.time if self.frames_time is None else self.frames_time
         if recorded is None:
-            _checked_frames(self.frames, len(time))
+            _check_frames(self.frames, len(time))
             return dict(self.frames)
         recorded = recorded.to(time)
-        return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
+        return {name: frame.resample(recorded, time) for name, frame in self.frames.items()}
 
 
 def _values(joints: Mapping[str, Any]) -> Tensor:
@@ -421,7 +421,7 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
         names = names or item.joint_names or ()
     for index, item in enumerate(checked):
         _check_alike(index, item, checked[0], names)
-    return [item.reordered(names) for item in checked]
+    return [item.reorder(names) for item in checked]
 
 
 def _check_alike(

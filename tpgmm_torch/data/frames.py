@@ -142,7 +142,7 @@ class Frame:
             quaternions.slerp(turn[lower], turn[lower + 1], fraction),
         )
 
-    def resampled(self, recorded: Tensor, wanted: Tensor) -> Frame:
+    def resample(self, recorded: Tensor, wanted: Tensor) -> Frame:
         """A moving frame at other times; before the first and after the last it stands still.
 
         Parameters

@@ -101,7 +101,7 @@ class Hold:
         begin, end = ("" if math.isinf(at) else repr(at) for at in (self.begin, self.end))
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
 
-    def retimed(self, clock: Callable[[float], float]) -> Self:
+    def retime(self, clock: Callable[[float], float]) -> Self:
         """The same hold on another clock.
 
         Parameters

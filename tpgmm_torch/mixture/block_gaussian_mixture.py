@@ -295,7 +295,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 f"the start has {given[0]} components in blocks of {given[1]} columns, "
                 f"asked for are {self.n_components} in blocks of {points.widths}"
             )
-        return [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
+        return [family.admit(start._parameters().affine(1 / scale, -shift / scale))]
 
     def _rows(self, X: Any) -> Rows:
         """The rows of X, checked."""
@@ -383,7 +383,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     @property
     def n_parameters_(self) -> int:
         """Number of free parameters: weights, means, and covariances of all blocks."""
-        k, widths = len(self._fitted().weights), list(map(_width, self.means_))
+        k, widths = len(self._parameters().weights), list(map(_width, self.means_))
         triangles = sum(width * (width + 1) // 2 for width in widths)
         covariances = {
             "full": k * triangles,
@@ -410,7 +410,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         labels : array of shape (n_samples,)
             The components that they came from, in ascending order.
         """
-        parameters = self._fitted()
+        parameters = self._parameters()
         if not isinstance(n_samples, Integral) or n_samples < 1:
             raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
         rng = check_random_state(self.random_state)
@@ -424,7 +424,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             columns.append(mean.cpu().numpy()[labels] + (factor[labels] @ normal)[..., 0])
         return np.concatenate(columns, axis=1).astype(self.dtype), labels
 
-    def _fitted(self) -> Parameters:
+    def _parameters(self) -> Parameters:
         """The fitted mixture in float64."""
         if not hasattr(self, "weights_"):
             raise NotFittedError(
@@ -435,7 +435,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
         """Apply a function to the log of weight times density, (K, n), of the rows."""
-        parameters, dtype = self._fitted(), self.weights_.dtype
+        parameters, dtype = self._parameters(), self.weights_.dtype
         points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
         # centred, so that offsets cost no digits
         center = torch.cat([parameters.weights @ mean for mean in parameters.means])

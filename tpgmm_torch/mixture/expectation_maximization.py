@@ -25,8 +25,8 @@ from tpgmm_torch.mixture.row_file import FILE_ROWS
 
 __all__ = [
     "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
-    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step", "reseed",
-    "whiten",
+    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step",
+    "restart_components", "whiten",
 ]  # fmt: skip
 
 #: A component is left out of a chunk where its responsibilities are below exp(-36), rounding,
@@ -393,7 +393,7 @@ def dead_components(
     return vanished | (few & (torch.cat(variances, 1).sum(1) <= 2 * floor))
 
 
-def reseed(
+def restart_components(
     proposal: Parameters,
     dead: Tensor,
     explaining: Parameters,
@@ -508,7 +508,7 @@ def expectation_maximization(
             left -= n_dead
             components = dead.nonzero()[:, 0].tolist()
             fit.reseedings.append(f"component(s) {components} in iteration {fit.n_iter}")
-            proposal = reseed(proposal, dead, current.parameters, points, rng)
+            proposal = restart_components(proposal, dead, current.parameters, points, rng)
             following = e_step(proposal, points, current.least)
             fit.bounds = [] if following.bound < lowest else [*fit.bounds, current.bound]
         else:

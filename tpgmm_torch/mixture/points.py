@@ -98,10 +98,10 @@ class Points:
             for first in range(0, len(order), self._size):
                 own = order[first : first + self._size]
                 chunk = memory[first * height :][: len(own) * height].view(height, -1)
-                chunk[self.values] = self.standardized(piece[own]).T.to(self.dtype)
+                chunk[self.values] = self.standardize(piece[own]).T.to(self.dtype)
                 yield chunk, numbers[first : first + len(own)]
 
-    def standardized(self, rows: NDArray[np.floating]) -> Tensor:
+    def standardize(self, rows: NDArray[np.floating]) -> Tensor:
         """Rows (n, sum D_j) of the data in standardised units, in float64."""
         return (torch.from_numpy(rows).to(self.shift) - self.shift).div_(self.scale)
 
@@ -130,5 +130,5 @@ class Points:
             wanted = np.unique(draws)
         places = wanted * every - self._first
         own = places[(places >= 0) & (places < len(self._rows))]
-        found = torch.cat(self.processes.gather(self.standardized(self._rows[own]).cpu()))
+        found = torch.cat(self.processes.gather(self.standardize(self._rows[own]).cpu()))
         return found.to(self.shift), torch.from_numpy(wanted).to(self.shift.device)

@@ -9,14 +9,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.arrays import Array, as_array, as_tensor
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, MissingLimitsWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -32,36 +30,8 @@ RISE_TIME, RISE_TIME_ALONE = 0.25, 0.1
 BELIEVABLE_SPEED = 4.0
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
-#: Share of a bound that rounding may add to it, and what it makes of the acceleration of a
-#: joint at constant speed [rad/s^2 or m/s^2].
+#: What rounding makes of the acceleration of a joint at constant speed [rad/s^2 or m/s^2].
 ROUNDING = 1e-9
-#: In place of an infinite bound where numbers have to be finite.
-ENDLESS = 1e9
-
-
-class LimitArrays(NamedTuple):
-    """Bounds as arrays of shape (n_joints,), and what every tick asks of them.
-
-    Parameters
-    ----------
-    lower, upper, velocity, acceleration, jerk : ndarray
-        The bounds, with room for rounding in the acceleration and the jerk.
-    half_over_jerk : ndarray
-        ``1 / 2J``: an acceleration a that is given up as fast as can be adds ``a^2 / 2J`` to
-        the speed.
-    stopping_time, stopping_distance : ndarray
-        A motion that reaches the speed v at most is stopped within
-        ``v * stopping_time + stopping_distance``.
-    """
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-    half_over_jerk: Array
-    stopping_time: Array
-    stopping_distance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,34 +118,11 @@ class MotionBounds:
         names = [field.name for field in fields(cls)]
         if unknown := [name for name in given if name not in names]:
             raise UnknownNameError("bound", unknown[0], "the bounds of a motion", names)
-        bound = {name: _tightened(name, kinematics, given.get(name)) for name in names}
+        bound = {name: _tighten_bound(name, kinematics, given.get(name)) for name in names}
         if bound["velocity"].isfinite().any():
             _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
-        bound |= _completed(bound, demonstrated)
+        bound |= _complete_rates(bound, demonstrated)
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
-
-    @cached_property
-    def arrays(self) -> LimitArrays:
-        """The same as arrays, and constants of stopping."""
-        values = (getattr(self, field.name) for field in fields(self))
-        lower, upper, velocity, acceleration, jerk = map(as_array, values)
-        with np.errstate(invalid="ignore", over="ignore"):
-            ramp = np.where(np.isinf(jerk), 0.0, acceleration / jerk)
-            brake = np.where(np.isinf(acceleration), 0.0, velocity / (2 * acceleration))
-            distance = acceleration * ramp * ramp / 3
-            stopping = 1.5 * ramp + brake
-        # nothing is in the way of a joint without limits of position; infinite times a speed
-        # of 0 would be no number
-        bounded = np.isfinite(lower) | np.isfinite(upper)
-        stopping, distance = (
-            np.where(bounded, np.nan_to_num(x, nan=ENDLESS, posinf=ENDLESS), 0.0)
-            for x in (stopping, distance)
-        )
-        room = 1 + ROUNDING
-        return LimitArrays(
-            lower, upper, velocity, acceleration * room, jerk * room, 0.5 / jerk, stopping,
-            distance,
-        )  # fmt: skip
 
 
 def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None:
@@ -199,7 +146,7 @@ def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None
         )
 
 
-def _completed(
+def _complete_rates(
     bound: Mapping[str, Tensor], demonstrated: tuple[Tensor, Tensor] | None
 ) -> dict[str, Tensor]:
     """Acceleration and jerk, also where they are infinite: of no robot and no user."""
@@ -224,7 +171,7 @@ def _completed(
     return {"acceleration": acceleration, "jerk": torch.where(jerk.isfinite(), jerk, usual)}
 
 
-def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
+def _tighten_bound(name: str, kinematics: Kinematics, given: Any) -> Tensor:
     """The robot's own bound and the user's."""
     own, joints = getattr(kinematics, name), kinematics.joint_names
     if own is None:

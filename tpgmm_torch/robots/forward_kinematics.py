@@ -60,7 +60,7 @@ class TreeKinematics:
         parents += [len(bodies) + parent for parent in parents]
         # each matrix's ancestor of degree 1, 2, 4, ...; by level, the matrices and where their
         # carriers stand among those of the level before; and where each comes to stand
-        self._ancestors = [self._index(ancestors) for ancestors in _doubled(parents)]
+        self._ancestors = [self._index(ancestors) for ancestors in _ancestors_by_power(parents)]
         levels = _levels(parents)
         self._levels = [self._index(level) for level in levels]
         self._carriers = [
@@ -195,7 +195,7 @@ def _motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array
     return factors, follow, shift
 
 
-def _doubled(parents: Sequence[int]) -> list[list[int]]:
+def _ancestors_by_power(parents: Sequence[int]) -> list[list[int]]:
     """Whom each matrix is multiplied by: its parent, its ancestor of degree 2, 4, ..."""
     hops, ahead = [], list(parents)
     while not set(ahead) <= {0, len(parents) // 2}:  # the base stands still

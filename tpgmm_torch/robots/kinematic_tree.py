@@ -88,7 +88,7 @@ def reduce(
         for far in reversed(way[:-1]):
             joint, near = steps[far]
             carrier, pose = places[near]
-            before, axis, after = _crossing(joint, near)
+            before, axis, after = _joint_transform(joint, near)
             leader = model.leader(joint.name) if joint.movable else None
             if leader and leader.joint in joints:
                 turn = _z_to(axis)
@@ -97,13 +97,13 @@ def reduce(
                 bodies.append(Body(carrier, pose @ before @ turn, *follow))
                 places[far] = len(bodies) - 1, turn.T @ after
             else:
-                at = _standing(leader, locked, link) if leader else 0.0
+                at = _locked_position(leader, locked, link) if leader else 0.0
                 places[far] = carrier, pose @ before @ motion(joint.type, axis, at) @ after
     ends = [(places[link], pose) for link, pose in links]
     return (*bodies, *(Body(carrier, place @ pose) for (carrier, place), pose in ends))
 
 
-def _standing(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
+def _locked_position(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
     """Where a joint stands that is not in the joint vector."""
     if leader.joint not in locked:
         raise DataError(
@@ -126,7 +126,7 @@ def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]
     return steps
 
 
-def _crossing(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
+def _joint_transform(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
     """From the near link of a joint to the far one: a pose, the axis of a motion, a pose."""
     if FREEDOMS[joint.type] > 1:
         raise DataError(

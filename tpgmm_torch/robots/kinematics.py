@@ -24,10 +24,10 @@ from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
-__all__ = ["Described", "Kinematics", "RobotState", "checked_dtype"]
+__all__ = ["Described", "Kinematics", "RobotState", "parse_dtype"]
 
 
-def checked_dtype(dtype: Any) -> torch.dtype:
+def parse_dtype(dtype: Any) -> torch.dtype:
     """The ``dtype`` of a robot, also given by its name, ``"float32"`` or ``"float64"``.
 
     Raises
@@ -120,7 +120,7 @@ class RobotState:
         n_robot = len(self.links) - len(self.carriers)
         return index if index < n_robot else self.carriers[index - n_robot]
 
-    def displaced(self, link: str, step: Tensor) -> Self:
+    def displace_link(self, link: str, step: Tensor) -> Self:
         """The state with a link taken to be elsewhere, with the same orientation and Jacobian.
 
         Parameters
@@ -199,7 +199,7 @@ class RobotState:
         carriers = *(self.carriers[i - first] for i in kept[first:]), carrier
         batch = common_shape(self.joints.shape[:-1], position.shape[:-1])
 
-        def joined(links: Tensor, new: Tensor, rank: int) -> Tensor:
+        def append_object(links: Tensor, new: Tensor, rank: int) -> Tensor:
             shape = *batch, *new.shape[new.ndim - rank :]
             old = (links.select(-1 - rank, i).expand(shape) for i in kept)
             return torch.stack((*old, new.expand(shape)), -1 - rank)
@@ -208,10 +208,10 @@ class RobotState:
             self,
             joints=self.joints.expand(*batch, -1),
             links=(*(self.links[i] for i in kept), name),
-            positions=joined(self.positions, position, 1),
-            orientations=joined(self.orientations, orientation, 1),
-            jacobians=joined(self.jacobians, jacobian, 2),
-            carriers=tuple(_expanded(one, batch) for one in carriers),
+            positions=append_object(self.positions, position, 1),
+            orientations=append_object(self.orientations, orientation, 1),
+            jacobians=append_object(self.jacobians, jacobian, 2),
+            carriers=tuple(_expand(one, batch) for one in carriers),
         )
 
     def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
@@ -247,7 +247,7 @@ class RobotState:
         return self.links.index(link)
 
 
-def _expanded(carrier: int | Tensor, batch: torch.Size) -> int | Tensor:
+def _expand(carrier: int | Tensor, batch: torch.Size) -> int | Tensor:
     return carrier.expand(batch) if isinstance(carrier, Tensor) else carrier
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
@@ -67,7 +67,7 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
     """
     if (tag := parse_xml(description_text(mjcf)).tag) != "mujoco":
         raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
-    return _Translation(compiled(mjcf, "the MJCF")).text()
+    return _Translation(compile_mjcf(mjcf, "the MJCF")).text()
 
 
 def mujoco_module(purpose: str) -> Any:
@@ -79,7 +79,7 @@ def mujoco_module(purpose: str) -> Any:
     return mujoco
 
 
-def compiled(mjcf: str | os.PathLike[str], what: str) -> Any:
+def compile_mjcf(mjcf: str | os.PathLike[str], what: str) -> Any:
     """The compiled model of an MJCF, a path or the text itself, that errors call ``what``."""
     mujoco = mujoco_module(f"compiling {what}")
     try:
@@ -159,33 +159,43 @@ class _Translation:
         The force of a servo is ``gain * control + bias . (1, l, l')`` with the length ``l``,
         ``gear * q``: it is in balance where that is zero.
         """
-        model, mujoco = self.model, self.mujoco
+        model = self.model
         lower, upper, velocity = -math.inf, math.inf, math.inf
         if model.jnt_limited[joint]:
             lower, upper = map(float, model.jnt_range[joint])
+        for servo in self._servos(joint):
+            low, high, speed = self._servo_limits(servo)
+            velocity = min(velocity, speed)
+            if max(low, lower) < min(high, upper):
+                lower, upper = max(low, lower), min(high, upper)
+        return lower, upper, velocity
+
+    def _servos(self, joint: int) -> NDArray[np.intp]:
+        """Find the actuators that drive a joint directly, against a force of its own."""
+        model, mujoco = self.model, self.mujoco
         direct = [mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT]
         is_servo = np.isin(model.actuator_trntype, direct) & (model.actuator_gear[:, 0] != 0)
         is_servo &= model.actuator_trnid[:, 0] == joint
         is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-        for servo in np.flatnonzero(is_servo):
-            constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
-            gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
-            commands = model.actuator_ctrlrange[servo]
-            limited = model.actuator_ctrllimited[servo]
-            if model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
-                if stiffness and limited:  # the control is the speed of what is commanded
-                    speeds = gain * commands / (stiffness * gear)
-                    velocity = min(velocity, float(np.abs(speeds).max()))
-                commands = model.actuator_actrange[servo]
-                limited = model.actuator_actlimited[servo]
-            ends = -(gain * commands + constant) / gear
-            if limited and stiffness:
-                low, high = sorted(map(float, ends / stiffness))
-                if max(low, lower) < min(high, upper):
-                    lower, upper = max(low, lower), min(high, upper)
-            elif limited and damping:
-                velocity = min(velocity, float(np.abs(ends / damping).max()))
-        return lower, upper, velocity
+        return np.flatnonzero(is_servo)
+
+    def _servo_limits(self, servo: int) -> tuple[float, float, float]:
+        """Compute lower, upper and velocity of one servo."""
+        model = self.model
+        low, high, velocity = -math.inf, math.inf, math.inf
+        constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
+        gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
+        commands, limited = model.actuator_ctrlrange[servo], model.actuator_ctrllimited[servo]
+        if model.actuator_dyntype[servo] == self.mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            if stiffness and limited:  # the control is the speed of what is commanded
+                velocity = float(np.abs(gain * commands / (stiffness * gear)).max())
+            commands, limited = model.actuator_actrange[servo], model.actuator_actlimited[servo]
+        ends = -(gain * commands + constant) / gear
+        if limited and stiffness:
+            low, high = sorted(map(float, ends / stiffness))
+        elif limited and damping:
+            velocity = min(velocity, float(np.abs(ends / damping).max()))
+        return low, high, velocity
 
     def _mimics(self) -> dict[int, Mimic]:
         """Joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by active equalities."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.robots.kinematics import Described, RobotState, checked_dtype
+from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 
 __all__ = ["Poses", "PosesState"]
 
@@ -162,7 +162,7 @@ class Poses(Described):
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """The poses that gave this ``config``."""
         cls._check_keys(config, "links", "orientation", "dtype")
-        dtype = checked_dtype(config["dtype"])
+        dtype = parse_dtype(config["dtype"])
         return cls(config["links"], config["orientation"], dtype, device)
 
     def __repr__(self) -> str:

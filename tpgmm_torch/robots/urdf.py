@@ -42,6 +42,8 @@ __all__ = [
     "write_urdf",
 ]
 
+#: Limits of a joint, in the order in which they are tabulated.
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 #: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.
 SINGLE = dict.fromkeys(("revolute", "continuous", "prismatic"), 1)
 FREEDOMS = {"fixed": 0, **SINGLE, "planar": 3, "floating": 6}
@@ -105,6 +107,12 @@ class UrdfJoint:
     doubts: tuple[str, ...] = ()
 
     @property
+    def lacks_limits(self) -> bool:
+        """Whether a limit of position or speed that it should have is not known."""
+        endless = self.type != "continuous" and math.isinf(self.upper)
+        return endless or math.isinf(self.velocity)
+
+    @property
     def movable(self) -> bool:
         """Whether it has one degree of freedom."""
         return FREEDOMS[self.type] == 1
@@ -148,7 +156,7 @@ class UrdfModel:
         return {joint.name: joint for joint in self.joints if joint.movable}
 
     @cached_property
-    def actuated(self) -> tuple[str, ...]:
+    def actuated_joints(self) -> tuple[str, ...]:
         """Names of those that follow no other joint."""
         return tuple(name for name, joint in self.movable.items() if joint.mimic is None)
 
@@ -248,7 +256,6 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     if root.tag != "robot":
         hint = ": that is an MJCF, Robot.from_mjcf reads it" if root.tag == "mujoco" else ""
         raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{hint}")
-    macros = sorted({each.tag for each in root.iter() if each.tag.startswith("xacro:")})
     try:
         links, _ = _names(root, "link"), _names(root, "joint")
         joints = tuple(map(_joint, root.findall("joint")))
@@ -257,11 +264,17 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         if UNEXPANDED.search(text):
             raise DataError(f"{XACRO}; {error}") from error
         raise
-    doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
+    doubts = _find_macros(root)
     if lost := _lost_mimicry(joints):
         joints = tuple(replace(j, mimic=None) if j.name in lost else j for j in joints)
         doubts.append(f"mimicry of what does not move, or in a circle, by {', '.join(lost)}")
     return UrdfModel(root.get("name", ""), text, base, links, joints, tuple(doubts))
+
+
+def _find_macros(root: ElementTree.Element) -> list[str]:
+    """List the doubt that macros are left over, if there are any."""
+    macros = sorted({part.tag for part in root.iter() if part.tag.startswith("xacro:")})
+    return [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
 
 
 def _lost_mimicry(joints: Iterable[UrdfJoint]) -> list[str]:
@@ -336,14 +349,14 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
     Without a range ``<limit>`` gives effort and velocity alone.
     """
     given: dict[str, str] = getattr(element.find("limit"), "attrib", {})
-    rates = ("velocity", "acceleration", "deceleration", "jerk")
-    limits: dict[str, Any] = {key: _number(given.get(key, math.inf)) for key in rates}
-    doubts = [f'{key}="{given[key][:20]}"' for key in rates if not limits[key] > 0]
-    limits = {key: rate for key, rate in limits.items() if rate > 0}
+    keys = ("velocity", "acceleration", "deceleration", "jerk")
+    rates = {key: _number(given.get(key, math.inf)) for key in keys}
+    doubts = [f'{key}="{given[key][:20]}"' for key in keys if not rates[key] > 0]
+    limits: dict[str, Any] = {key: rate for key, rate in rates.items() if rate > 0}
     slowing = limits.pop("deceleration", math.inf)
     limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
-    low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
     if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
+        low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
         # CAD programs write zeros where nobody has filled in anything
         if low < high or (low == high and not doubts):
             limits |= {"lower": low, "upper": high}
@@ -465,10 +478,8 @@ def joint_element(joint: UrdfJoint) -> ElementTree.Element:
     if not joint.movable:
         return element
     ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
-    keys = ("lower", "upper", "velocity", "acceleration", "jerk")
-    limits = {
-        key: numbers([value]) for key in keys if abs(value := getattr(joint, key)) < math.inf
-    }
+    given = {key: getattr(joint, key) for key in LIMITS}
+    limits = {key: numbers([value]) for key, value in given.items() if abs(value) < math.inf}
     if limits:
         ElementTree.SubElement(element, "limit", limits)
     if joint.mimic is not None:

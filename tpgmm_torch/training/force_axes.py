@@ -45,12 +45,12 @@ def with_force_axes(
         If no force does no work, or a link is never in contact.
     """
     return tuple(
-        _completed(one, motions) if isinstance(one, Wrench) and one.axes is None else one
+        _choose_axes(one, motions) if isinstance(one, Wrench) and one.axes is None else one
         for one in operators
     )
 
 
-def _completed(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
+def _choose_axes(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
     shares, sizes = (each.tolist() for each in shares_of_work(operator, motions))
     every = list(zip("xyz", shares, sizes, strict=True))
     found = [s < NO_WORK and size >= operator.contact for _, s, size in every]

@@ -107,7 +107,7 @@ def find_holds(
     motions = [_Motion(one, kinematics, change) for one in demonstrations]
     holds: list[Hold] = []
     for name in known if frames is None else frames:
-        holds += _agreed([motion.holds(name) for motion in motions], agreement)
+        holds += _most_common_holds([motion.holds(name) for motion in motions], agreement)
     return check_holds(holds, known, kinematics.links)
 
 
@@ -222,7 +222,7 @@ class _Motion:
     @cached_property
     def links(self) -> dict[str, Frame]:
         """Poses (T,) of the links."""
-        ordered = self.demonstration.reordered(self.kinematics.joint_names)
+        ordered = self.demonstration.reorder(self.kinematics.joint_names)
         state = self.kinematics.state(ordered.joints)
         return {link: state.pose(link) for link in self.kinematics.links}
 
@@ -281,12 +281,14 @@ class _Motion:
         lifted = first + max(int((~at_rest[first : seed + 1]).int().argmax()) - 1, 0)
         at_rest = change(pose[last : last + 1], pose) <= finest
         put = last - int((~at_rest[seed : last + 1]).flip(0).int().argmax()) + 1
-        begin = float(self.time[self._touched(link, pose, first, lifted, finest)])
+        begin = float(self.time[self._find_touch(link, pose, first, lifted, finest)])
         end = float(self.time[last] + self.time[min(put, last)]) / 2
         end = math.inf if last == len(self.time) - 1 else end
         return (first, last, Hold(name, link, begin, end)) if begin < end else None
 
-    def _touched(self, link: str, pose: Frame, first: int, lifted: int, finest: float) -> int:
+    def _find_touch(
+        self, link: str, pose: Frame, first: int, lifted: int, finest: float
+    ) -> int:
         """The instant since which a link stands as it does before it lifts an object."""
         hand, change = self.links[link], self.change
         sooner, later = self._window()
@@ -323,7 +325,7 @@ def _run(true: Tensor, seed: int) -> tuple[int, int]:
     return first, int(after[0]) - 1 if len(after) else len(true) - 1
 
 
-def _agreed(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
+def _most_common_holds(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
     """Of the holds of one object in each demonstration, what most of them show."""
     orders = [tuple(hold.link for hold in holds) for holds in shown]
     [(order, count)] = Counter(filter(None, orders)).most_common(1) or [((), 0)]

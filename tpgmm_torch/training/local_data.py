@@ -14,7 +14,6 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -68,7 +67,7 @@ class Motion:
                 f"a demonstration has {demonstration.n_joints} joints, the robot has {n}: "
                 f"{kinematics.joint_names}"
             )
-        ordered = demonstration.reordered(kinematics.joint_names)
+        ordered = demonstration.reorder(kinematics.joint_names)
         state = kinematics.state(ordered.joints)
         if ordered.wrenches:
             measured = {link: one.to(state.joints) for link, one in ordered.wrenches.items()}
@@ -114,9 +113,10 @@ def local_data(
         If a demonstration has not the robot's joints.
     """
     motions = [Motion.of(one, kinematics, holds) for one in demonstrations]
-    rows = list(rows_of(motions, operators, kinematics, expected))
     if expected is not None:
-        return rows
+        return list(rows_of(motions, operators, kinematics, expected))
+    first = like([motions[0].coordinates(one, kinematics) for one in operators])
+    rows = list(rows_of(motions, operators, kinematics, first))
     together = torch.cat(rows)
     low, high = together.aminmax(dim=0)
     mask = constant_columns(low, high, operators, kinematics)
@@ -128,33 +128,26 @@ def rows_of(
     motions: Iterable[Motion],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    expected: Expected | None = None,
-    processes: Processes = ALONE,
+    expected: Expected,
 ) -> Iterator[Tensor]:
     """Rows of time and local coordinates of motions, one after the other.
 
     Parameters
     ----------
     motions : iterable of Motion
-        At least one.
     operators : sequence of Operator
     kinematics : Kinematics
-    expected : callable, optional
-        Quaternions come to the side of what it says; by default to that of the first motion.
-    processes : Processes
-        Of which the first has the first motion.
+    expected : callable
+        Quaternions come to the side of what it says.
 
     Yields
     ------
     Tensor of shape (T_m, sum_j (1 + D_j))
     """
     for motion in motions:
-        local = [motion.coordinates(one, kinematics) for one in operators]
-        if expected is None:
-            first = processes.gather([block.cpu() for block in local])[0]
-            expected = like([block.to(kinematics.lower) for block in first])
         blocks: list[Tensor] = []
-        for j, (operator, block) in enumerate(zip(operators, local, strict=True)):
+        for j, operator in enumerate(operators):
+            block = motion.coordinates(operator, kinematics)
             template, sign = expected(j, motion.time), torch.ones_like(block[0])
             for start in operator.quaternion_starts(kinematics):
                 columns = slice(start, start + 4)
@@ -172,11 +165,7 @@ def like(templates: Sequence[Tensor]) -> Expected:
     templates : sequence of Tensor of shape (T, D_j)
         Of each operator.
     """
-
-    def expected(j: int, time: Tensor) -> Tensor:
-        return at_phases(templates[j], len(time))
-
-    return expected
+    return lambda j, time: at_phases(templates[j], len(time))
 
 
 def at_phases(rows: Tensor, count: int) -> Tensor:

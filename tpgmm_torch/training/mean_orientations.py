@@ -37,9 +37,9 @@ def with_mean_orientations(
     grid = max((one.time for one in motions), key=lambda time: float(time[-1]))
     instants = grid.double()
 
-    def completed(operator: Operator) -> Operator:
+    def add_path(operator: Operator) -> Operator:
         if isinstance(operator, Stack):
-            return Stack(*map(completed, operator.operators))
+            return Stack(*map(add_path, operator.operators))
         if not isinstance(operator, AbsoluteOrientation | RelativeOrientation):
             return operator
         if operator.geometry != "tangent" or operator.path is not None:
@@ -55,4 +55,4 @@ def with_mean_orientations(
         rows = torch.cat((instants.unsqueeze(-1), means), -1)
         return replace(operator, path=tuple(map(tuple, rows.tolist())))
 
-    return tuple(map(completed, operators))
+    return tuple(map(add_path, operators))

@@ -15,7 +15,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.operators import Canonical, Operator
@@ -257,7 +257,7 @@ def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:
     ]
     return Finding(
         "outliers",
-        f"{len(outlying)} of {count} are unlike the others: {listed(places)}",
+        f"{len(outlying)} of {count} are unlike the others: {shorten_list(places)}",
         "Is the frame right, and the event's time? drop_outliers(demonstrations, operators, "
         "robot) leaves them out",
         (format_operator(worst.operator),),

@@ -22,7 +22,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import equivalent_rows
 from tpgmm_torch.training.force_axes import with_force_axes
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, rows_of
+from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, like, rows_of
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import block_widths
 
@@ -204,18 +204,22 @@ def read_rows(
     motions = [Motion.of(one, kinematics, holds) for one in head]
     completed = with_mean_orientations(with_force_axes(operators, motions), motions, kinematics)
     operators = processes.gather(completed)[0]
+    shown = processes.gather(
+        [motions[0].coordinates(one, kinematics).cpu() for one in operators]
+    )
+    expected = like([block.to(kinematics.lower) for block in shown[0]])
     following = chain.from_iterable(chain([later or ()], walk))
     all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
-    each = rows_of(all_motions, operators, kinematics, processes=processes)
-    stored, edges = _stored((rows.cpu().numpy() for rows in each), alone)
-    first = _made_constant(stored, edges[1], operators, kinematics, processes)
+    each = rows_of(all_motions, operators, kinematics, expected)
+    stored, edges = _store_rows((rows.cpu().numpy() for rows in each), alone)
+    first = _remove_rounding(stored, edges[1], operators, kinematics, processes)
     time, number = _typical_time(stored, edges, processes)
     time, own = time.to(kinematics.lower), tuple(operators)
     rows = TrainingRows(stored, 1, time, number, own, holds, processes, stored, edges)
-    return _grouped(rows, first, responsibilities, block_widths(operators, kinematics))
+    return _group_instants(rows, first, responsibilities, block_widths(operators, kinematics))
 
 
-def _stored(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
+def _store_rows(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
     """Rows of all demonstrations, in a file unless in one batch, and where each begins."""
     kept: Any = [] if alone else RowFile()
     lengths = [0]
@@ -225,7 +229,7 @@ def _stored(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np
     return np.concatenate(kept) if alone else kept, np.cumsum(lengths)
 
 
-def _made_constant(
+def _remove_rounding(
     stored: Rows,
     length: int,
     operators: Sequence[Operator],
@@ -243,7 +247,7 @@ def _made_constant(
     return np.where(constant, first[0], first)
 
 
-def _grouped(
+def _group_instants(
     rows: TrainingRows, first: NDArray[Any], responsibilities: str, widths: Sequence[int]
 ) -> TrainingRows:
     """Rows of one instant together where the demonstrations have one time grid.

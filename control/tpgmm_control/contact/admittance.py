@@ -135,5 +135,7 @@ class Offsets:
         """
         for operator, value in self.values.items():
             axes = operator.directions(state, frames)
-            state = state.displaced(operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2))
+            state = state.displace_link(
+                operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2)
+            )
         return state

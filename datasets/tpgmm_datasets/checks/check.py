@@ -15,7 +15,7 @@ from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.checks.training import in_order, unit_findings
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot
@@ -154,11 +154,11 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         at = [f"at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}" for i in odd]
         lost = [i for i in range(len(episodes)) if i not in phases]
         if lost and len(lost) < len(there):
-            at, odd = [*at, f"missing in {listed([str(i) for i in lost])}"], [*odd, *lost]
+            at, odd = [*at, f"missing in {shorten_list([str(i) for i in lost])}"], [*odd, *lost]
         places += [f"{name!r} {text}" for text in at]
         about.update(odd)
     if places:
-        message = f"events are not where they usually are: {listed(places)}"
+        message = f"events are not where they usually are: {shorten_list(places)}"
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
     for first, second in combinations(names, 2):
         pair = {first, second}
@@ -169,7 +169,7 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
             ahead, order = [i for i in both if i not in ahead], (second, first)
         if 0 < len(ahead) <= len(both) / 4:
             message = f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
-            these = listed([str(i) for i in ahead])
+            these = shorten_list([str(i) for i in ahead])
             yield Finding("events", message + these, BY_HAND, order, tuple(ahead))
 
 

@@ -88,14 +88,14 @@ def test_quaternions_are_found_by_the_names_of_the_joints():
     poses = Poses(["hand"])
     assert quaternion_columns(own, poses) == [[3, 4, 5, 6]]
     names = own.joint_names
-    assert quaternion_columns(own.reordered(names[::-1]), poses) == [[3, 2, 1, 0]]
+    assert quaternion_columns(own.reorder(names[::-1]), poses) == [[3, 2, 1, 0]]
     plain = Demonstration(own.time, own.joints)
     assert quaternion_columns(plain, poses) == [[3, 4, 5, 6]]
     assert quaternion_columns(plain, None) == quaternion_columns(plain, Arm()) == []
     with pytest.raises(ShapeError, match="has 3 joints without names, the robot has 7"):
         quaternion_columns(Demonstration(time, np.ones((30, 3))), poses)
     with pytest.raises(UnknownNameError, match=r"'hand\.qw' is not in the demonstration"):
-        quaternion_columns(own.reordered(names[:3]), poses)
+        quaternion_columns(own.reorder(names[:3]), poses)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from tests.support.robot_zoo import assert_differences_agree, random_joints, upp
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import RobotState
-from tpgmm_torch.robots.kinematics import checked_dtype
+from tpgmm_torch.robots.kinematics import parse_dtype
 
 #: A grasp.
 CUP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
@@ -235,7 +235,7 @@ def test_joints_may_be_given_by_name(batch: tuple[int, ...]) -> None:
 
 
 def test_dtypes_go_by_name() -> None:
-    assert checked_dtype("float32") == checked_dtype(torch.float32) == torch.float32
+    assert parse_dtype("float32") == parse_dtype(torch.float32) == torch.float32
     for dtype in ("float16", torch.float16):
         with pytest.raises(DataError, match=r"one of \['float32', 'float64'\], got .*float16"):
-            checked_dtype(dtype)
+            parse_dtype(dtype)

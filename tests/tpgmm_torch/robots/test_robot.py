@@ -57,7 +57,9 @@ def test_published_robots_are_where_pinocchio_has_them(file: Path) -> None:
         model = read_urdf(file)
         links = random.Random(0).sample(model.links, min(3, len(model.links)))
         robot = Robot.from_urdf(file, links)
-    leaders = {name: model.leader(name) for name in model.movable if name not in model.actuated}
+    leaders = {
+        name: model.leader(name) for name in model.movable if name not in model.actuated_joints
+    }
     followers = {n: (on.joint, on.multiplier, on.offset) for n, on in leaders.items()}
     oracle = Pinocchio(pin.buildModelFromUrdf(str(file)), followers)
     joints = random_joints(robot)
@@ -433,14 +435,14 @@ class TestCombining:
 
     def test_joints_of_any_unit_have_no_limits_where_they_move_no_link(self) -> None:
         robot = zoo(("tip", "flange"))
-        free = robot.unlimited(robot.joint_names)
+        free = robot.drop_limits(robot.joint_names)
         assert [bool(x) for x in free.upper.isinf()] == [
             name == "grip" or bool(robot.upper[i].isinf())
             for i, name in enumerate(robot.joint_names)
         ]
         joints = random_joints(robot, 3)
         assert torch.equal(free.state(joints).jacobians, robot.state(joints).jacobians)
-        assert free == robot.unlimited(["grip"]) == Robot.from_config(free.config())
+        assert free == robot.drop_limits(["grip"]) == Robot.from_config(free.config())
 
 
 class TestErrors:

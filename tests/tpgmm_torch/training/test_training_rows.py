@@ -89,7 +89,7 @@ def test_batches_are_read_once_and_may_come_from_a_generator():
 def test_names_order_the_joints_of_all_batches():
     names = waves()[0].joint_names or tuple(f"j{i}" for i in range(waves()[0].n_joints))
     named = [replace(wave, joint_names=names) for wave in waves(4)]
-    turned = [*named[:2], *(wave.reordered(names[::-1]) for wave in named[2:])]
+    turned = [*named[:2], *(wave.reorder(names[::-1]) for wave in named[2:])]
     assert_same(canonical().fit(Batches(turned)), canonical().fit(named))
 
 

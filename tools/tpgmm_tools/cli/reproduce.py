@@ -106,7 +106,7 @@ def reproduce(
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
     for number, one in enumerate(wanted if isinstance(skill, Ways) else ()):
-        situation = one.reordered(kinematics.joint_names)
+        situation = one.reorder(kinematics.joint_names)
         [choice] = skill.choose(situation.joints, at_first(situation))
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-__all__ = ["changed"]
+__all__ = ["replace_fields"]
 
 
-def changed[State](state: State, **values: Any) -> State:
-    """A frozen dataclass with other values of some fields.
+def replace_fields[State](state: State, **values: Any) -> State:
+    """Copy a frozen dataclass with other values of some fields.
 
     ``dataclasses.replace`` without initialising it again, which for twenty fields takes
     longer than what a tick computes of them.
