@@ -15,7 +15,7 @@ from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, Report
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.training import in_order, unit_findings
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot

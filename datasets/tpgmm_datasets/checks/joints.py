@@ -9,7 +9,7 @@ import numpy as np
 from tpgmm_datasets.checks.places import found_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
-from tpgmm_torch.checks.report import Finding
+from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import FAR, IMPOSSIBLE, ranges
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.pose_names import is_gripper, pose_groups, quaternion_groups

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from math import nan
 
-from tpgmm_torch.checks.report import Finding
+from tpgmm_torch.checks.report import Finding, shorten_list
 
 __all__ = ["found_at"]
 

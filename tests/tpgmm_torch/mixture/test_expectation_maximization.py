@@ -27,7 +27,7 @@ from tpgmm_torch.mixture.expectation_maximization import (
     expectation_maximization,
     log_joint,
     m_step,
-    reseed,
+    restart_components,
 )
 
 K = 8
@@ -251,7 +251,9 @@ def test_dead_components_start_at_badly_explained_points(group_size):
     order = reference_joint(parameters, columns(points), group_size).logsumexp(1).argsort()
     ranks = []
     for seed in range(30):
-        found = reseed(parameters, dead, parameters, points, np.random.RandomState(seed))
+        found = restart_components(
+            parameters, dead, parameters, points, np.random.RandomState(seed)
+        )
         places = torch.cat(found.means, 1)
         torch.testing.assert_close(places[~dead], torch.cat(parameters.means, 1)[~dead])
         ranks += [int((rows[order] == place).all(1).nonzero()[0, 0]) for place in places[dead]]
