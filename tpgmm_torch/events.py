@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -72,6 +72,13 @@ class Boundary:
     end: float
     prepares: bool = False
 
+    def join_stop(self, stop: Boundary) -> Boundary:
+        """Join the boundary with a ``stop`` at which it happens."""
+        # poses alone locate a contact less exactly than a stop
+        exact = self.begin < self.end and stop.begin <= self.time <= stop.end
+        time = self.time if exact else stop.time
+        return replace(self, time=time, reason=f"{self.reason}, stop", prepares=False)
+
 
 def find_boundaries(
     demonstration: Demonstration, robot: Any = None, *, margin: float = 0.05
@@ -105,11 +112,8 @@ def find_boundaries(
     for stop in find_stops(demonstration, robot):
         early, late = stop.begin - near_by, stop.end + near_by
         near = [i for i, one in enumerate(found) if early <= one.time <= late]
-        for i in near:  # poses alone locate a contact less exactly than a stop
-            exact = found[i].begin < found[i].end and stop.begin <= found[i].time <= stop.end
-            time = found[i].time if exact else stop.time
-            reason = f"{found[i].reason}, stop"
-            found[i] = replace(found[i], time=time, reason=reason, prepares=False)
+        for i in near:
+            found[i] = found[i].join_stop(stop)
         if not near:
             found.append(stop)
     return sorted((one for one in found if not one.prepares), key=lambda one: one.time)
@@ -148,12 +152,19 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
     holds = () if robot is None else find_holds([demonstration], robot)
     happen = [(hold.begin, f"{hold.frame} is taken") for hold in holds]
     happen += [(hold.end, f"{hold.frame} is let go") for hold in holds]
-    held = {hold.frame for hold in holds}
-    for name, frame in demonstration.frames.items():
-        if name not in held and frame.batch_shape:
-            at, sure = move_start(as_array(frame.position), as_array(demonstration.time))
-            happen += [(at, f"{name} moves")] if sure >= LEAST_CONFIDENCE else []
+    happen += _object_moves(demonstration, {hold.frame for hold in holds})
     return [Boundary(at, reason, at, at) for at, reason in happen if begin < at < end]
+
+
+def _object_moves(
+    demonstration: Demonstration, others: Collection[str]
+) -> Iterator[tuple[float, str]]:
+    """Yield when each object begins to move that is not among others, and the reason."""
+    for name, frame in demonstration.frames.items():
+        if name not in others and frame.batch_shape:
+            at, sure = move_start(as_array(frame.position), as_array(demonstration.time))
+            if sure >= LEAST_CONFIDENCE:
+                yield at, f"{name} moves"
 
 
 def find_stops(
@@ -220,19 +231,23 @@ def _crossing(time: Array, speed: Array, below: int, way: int, limit: float) -> 
 
 def _robot_speed(demonstration: Demonstration, robot: Any) -> Array:
     """Of all links together, of the joints but for grippers without links, smoothed, (T,)."""
-    time, names = as_array(demonstration.time), demonstration.joint_names or ()
     if robot is not None and robot.links:
-        state = robot.state(demonstration.reorder(robot.joint_names).joints)
-        columns = [as_array(state.position(link)) for link in robot.links]
-        if getattr(robot, "orientation", True):  # tracked points have none
-            turns = [quaternions.continuous(state.orientation(link)) for link in robot.links]
-            columns += [2 * LEVER * as_array(turn) for turn in turns]  # half the angle
-        values = np.concatenate(columns, axis=1)
+        values = _link_coordinates(demonstration, robot)
     else:
-        joints = as_array(demonstration.joints)
-        grippers = {j for j, name in enumerate(names) if is_gripper(name)}
-        values = joints[:, [j for j in range(joints.shape[1]) if j not in grippers]]
-    return smooth_speed(values, time, SMOOTHING)
+        joints, names = as_array(demonstration.joints), demonstration.joint_names or ()
+        grippers = [j for j, name in enumerate(names) if is_gripper(name)]
+        values = np.delete(joints, grippers, axis=1)
+    return smooth_speed(values, as_array(demonstration.time), SMOOTHING)
+
+
+def _link_coordinates(demonstration: Demonstration, robot: Any) -> Array:
+    """Compute positions of all links, and their orientations as lengths, (T, D)."""
+    state = robot.state(demonstration.reorder(robot.joint_names).joints)
+    columns = [as_array(state.position(link)) for link in robot.links]
+    if getattr(robot, "orientation", True):  # tracked points have none
+        turns = [quaternions.continuous(state.orientation(link)) for link in robot.links]
+        columns += [2 * LEVER * as_array(turn) for turn in turns]  # half the angle
+    return np.concatenate(columns, axis=1)
 
 
 def smooth_speed(values: Array, time: Array, length: float) -> Array:

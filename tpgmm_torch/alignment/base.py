@@ -57,12 +57,7 @@ def retime(
     place = torch.from_numpy(at)
     lower = place.floor().long().clamp(0, len(demonstration) - 2)
     fraction = place - lower
-    start, end = joints[lower.to(joints.device)], joints[lower.to(joints.device) + 1]
-    weight = fraction.to(joints)
-    moved = torch.lerp(start, end, weight[:, None])
-    for block in map(list, quaternion_blocks):
-        before, after = (quaternions.normalize(values[:, block]) for values in (start, end))
-        moved[:, block] = quaternions.slerp(before, after, weight)
+    moved = _interpolate_joints(joints, lower, fraction, quaternion_blocks)
     frames = {
         name: frame.between(lower, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
@@ -88,6 +83,19 @@ def retime(
         for link, wrench in demonstration.wrenches.items()
     }
     return Demonstration(time, moved, frames, names, events, holds, wrenches)
+
+
+def _interpolate_joints(
+    joints: Tensor, lower: Tensor, fraction: Tensor, quaternion_blocks: Sequence[Sequence[int]]
+) -> Tensor:
+    """Interpolate between time steps and the next ones, quaternions by slerp."""
+    lower, weight = lower.to(joints.device), fraction.to(joints)
+    start, end = joints[lower], joints[lower + 1]
+    moved = torch.lerp(start, end, weight[:, None])
+    for block in map(list, quaternion_blocks):
+        before, after = (quaternions.normalize(values[:, block]) for values in (start, end))
+        moved[:, block] = quaternions.slerp(before, after, weight)
+    return moved
 
 
 class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from typing import Any, Self
@@ -190,12 +190,7 @@ class EventAlignment(LinearTimeNormalization):
                 "load_lerobot, --event), or use LinearTimeNormalization"
             )
         for name in wanted:
-            lost = [i for i, one in enumerate(demonstrations) if name not in one.events]
-            if lost:
-                raise DataError(
-                    f"event {name!r} is missing in demonstrations {lost}; events are "
-                    f"{sorted(known)}. Leave them out, or align at others: events=[...]"
-                )
+            _check_event(name, demonstrations, known)
         if self.events is not None:
             return tuple(wanted)
         return tuple(sorted(wanted, key=lambda name: _median_phase(name, demonstrations)))
@@ -289,6 +284,18 @@ class EventAlignment(LinearTimeNormalization):
                 evenly[inside] = np.interp(grid[inside], clock, path)
         instants: Array = np.interp(evenly, self._instants, self._anchors(demonstration))
         return instants
+
+
+def _check_event(
+    name: str, demonstrations: Sequence[Demonstration], known: Iterable[str]
+) -> None:
+    """Refuse an event that a demonstration does not have."""
+    lost = [i for i, one in enumerate(demonstrations) if name not in one.events]
+    if lost:
+        raise DataError(
+            f"event {name!r} is missing in demonstrations {lost}; events are "
+            f"{sorted(known)}. Leave them out, or align at others: events=[...]"
+        )
 
 
 def _median_phase(event: str, demonstrations: Sequence[Demonstration]) -> float:

@@ -147,8 +147,8 @@ class FrameSummary:
         # Journal of Guidance, Control, and Dynamics 30 (2007), eq. (12)
         mean = np.linalg.eigh(turns.T @ turns)[1][:, -1]
         rotations = _rotation_vectors(mean, turns)
-        fixed = not any(path.recorded for path in paths)
-        same = [name for name, pose in links.items() if fixed and _same(pose, first)]
+        recorded = any(path.recorded for path in paths)
+        events = {path.at for path in paths}
         return cls(
             np.min([path.low for path in paths], axis=0).tolist(),
             np.max([path.high for path in paths], axis=0).tolist(),
@@ -157,8 +157,8 @@ class FrameSummary:
             Region.of(places, "place"),
             Region.of(rotations, "turn"),
             any(path.moves for path in paths),
-            same[0] if same else None,
-            paths[0].at if len({path.at for path in paths}) == 1 else None,
+            None if recorded else next((n for n, p in links.items() if _same(p, first)), None),
+            paths[0].at if len(events) == 1 else None,
         )
 
     def rotation_vectors(self, orientations: Array) -> Array:
@@ -210,20 +210,20 @@ class TrainingSummary:
 
     def __post_init__(self) -> None:
         n, count = len(self.joint_names), self.n_demonstrations
-        compared = [j for j in self.compared if type(j) is int and 0 <= j < n]
+        compared = _count_indices(self.compared, n)
         _check_numbers(
             self,
             n_demonstrations=(),
             limit=(),
             start_low=(n,),
             start_high=(n,),
-            compared=(len({*compared}),),
+            compared=(compared,),
             postures=(len(self.postures), n) if self.postures else (0,),
         )
         if type(count) is not int or count < 1 or self.limit <= 0:
             raise DataError(f"there are {count} demonstrations, and the limit is {self.limit}")
-        if len(self.start.mean) != len(compared):
-            raise DataError(f"{len(self.start.mean)} joints are compared, not {len(compared)}")
+        if len(self.start.mean) != compared:
+            raise DataError(f"{len(self.start.mean)} joints are compared, not {compared}")
         if not all(0 <= at <= 1 for at in self.events.values()):
             raise DataError(f"events are shares of the duration, got {self.events}")
 
@@ -240,18 +240,13 @@ class TrainingSummary:
         starts = np.stack([episode.start for episode in episodes])
         state = kinematics.state(starts)
         links = {link: state.pose(link) for link in kinematics.links}
-        turns = [
-            *(range(first, first + 4) for first in kinematics.quaternion_starts),
-            *quaternion_groups(kinematics.joint_names),
-        ]
-        compared = np.setdiff1d(range(kinematics.n_joints), np.ravel(turns)).tolist()
+        compared = _compared_joints(kinematics)
         vectors, frames = [("start", starts[:, compared])], dict[str, FrameSummary]()
         for name in episodes[0].frames:
             paths = [episode.frames[name] for episode in episodes]
             first, frames[name] = _first_poses(paths), FrameSummary.of(paths, links)
             rotations = frames[name].rotation_vectors(as_array(first.orientation))
             vectors += [("place", as_array(first.position)), ("turn", rotations)]
-        common = set.intersection(*(set(episode.events) for episode in episodes))
         return cls(
             len(episodes),
             tuple(kinematics.joint_names),
@@ -261,10 +256,7 @@ class TrainingSummary:
             Region.of(starts[:, compared], "start"),
             _largest_distance(vectors),
             frames,
-            {
-                name: float(np.median([episode.events[name] for episode in episodes]))
-                for name in sorted(common, key=list(episodes[0].events).index)
-            },
+            _median_events(episodes),
             differing(np.concatenate([one.postures for one in episodes])).round(4).tolist(),
         )
 
@@ -437,6 +429,24 @@ class TrainingSummary:
         return f"{name}: turned by {degrees}{np.rad2deg(known.angle):.0f}", remedy, ()
 
 
+def _compared_joints(kinematics: Kinematics) -> list[int]:
+    """List the columns of the joints that are no parts of a quaternion."""
+    turns = [
+        *(range(first, first + 4) for first in kinematics.quaternion_starts),
+        *quaternion_groups(kinematics.joint_names),
+    ]
+    return np.setdiff1d(range(kinematics.n_joints), np.ravel(turns)).tolist()
+
+
+def _median_events(episodes: Sequence[EpisodeSummary]) -> dict[str, float]:
+    """Compute median times of the events that all demonstrations have."""
+    return {
+        name: float(np.median([episode.events[name] for episode in episodes]))
+        for name in episodes[0].events
+        if all(name in episode.events for episode in episodes)
+    }
+
+
 def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
     """The largest distance of a demonstration from the regions of the others."""
     n = len(vectors[0][1])
@@ -501,6 +511,11 @@ def _rotation_vectors(mean: Array, orientations: Array) -> Array:
         quaternions.conjugate(torch.from_numpy(mean)), torch.from_numpy(np.array(orientations))
     )
     return as_array(quaternions.log(turns))
+
+
+def _count_indices(values: Iterable[Any], n: int) -> int:
+    """Count the different integers from 0 to n - 1 among values."""
+    return sum(type(value) is int and 0 <= value < n for value in {*values})
 
 
 def _check_numbers(thing: Any, **shapes: tuple[int, ...]) -> None:

@@ -256,8 +256,7 @@ def unit_findings(
 
 def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Iterator[Finding]:
     """Joints beyond the limits: in another unit, in another order, or of another robot."""
-    low = np.min([episode.low for episode in episodes], axis=0)
-    high = np.max([episode.high for episode in episodes], axis=0)
+    low, high = _joint_ranges(episodes)
     limits = np.stack((as_array(kinematics.lower), as_array(kinematics.upper)))
     allowed = BEYOND * np.minimum(limits[1] - limits[0], 1.0)
     # of the joints of the robot (rows) in the columns that were given
@@ -293,6 +292,12 @@ def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Itera
             "(joint_names=[...])"
         )
     yield Finding(check, message, remedy, about, value=value, impossible=bool(impossible))
+
+
+def _joint_ranges(episodes: Sequence[EpisodeSummary]) -> tuple[Array, Array]:
+    """Compute the least and largest value of each joint."""
+    low = np.min([episode.low for episode in episodes], axis=0)
+    return low, np.max([episode.high for episode in episodes], axis=0)
 
 
 def ranges(

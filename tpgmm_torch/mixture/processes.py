@@ -76,6 +76,28 @@ class Processes:
             _exchange(lambda: dist.all_gather_object(values, value))
         return values
 
+    @staticmethod
+    def check_share(shares: Sequence[Any], what: str) -> None:
+        """Refuse that a process has none of the data, or nobody has.
+
+        Parameters
+        ----------
+        shares : sequence
+            Something true of each process that has some.
+        what : str
+            How the error message calls the data.
+
+        Raises
+        ------
+        DataError
+            If there is none; the message says in which process.
+        """
+        if empty := [rank for rank, share in enumerate(shares) if not share]:
+            where = f" in process(es) {empty} of {len(shares)}" if len(shares) > 1 else ""
+            raise DataError(
+                f"there are no {what}s, X is empty{where}: expected at least one {what}"
+            )
+
     def share[T](self, items: Sequence[T]) -> list[T]:
         """The consecutive part of ``items`` that is this process's, equal up to one.
 

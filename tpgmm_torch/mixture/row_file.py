@@ -143,17 +143,12 @@ class ColumnMoments:
             If a process has no rows, if the processes' rows have different numbers of
             columns, or if the variance overflows.
         """
-        counts, widths = zip(*processes.gather(rows.shape), strict=True)
-        if empty := [rank for rank, count in enumerate(counts) if not count]:
-            where = f" in process(es) {empty} of {processes.count}"
-            raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
-        if len(set(widths)) > 1:
-            raise DataError(f"the processes' rows have {widths} columns: all need the same")
+        count = _count_rows(rows, processes)
 
-        def everywhere(own: list[Array], joined: np.ufunc = np.add) -> Array:
-            return np.asarray(joined.reduce(processes.gather(joined.reduce(own))))
+        def everywhere(parts: list[Array], join: np.ufunc = np.add) -> Array:
+            return np.asarray(join.reduce(processes.gather(join.reduce(parts))))
 
-        count, first = sum(counts), processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
+        first = processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
         with np.errstate(over="ignore", invalid="ignore"):
             # seen from the first row, so that a constant column varies by nothing at all
             mean = first + everywhere([(part - first).sum(0) for part in pieces(rows)]) / count
@@ -183,3 +178,12 @@ class ColumnMoments:
         blocks = np.split(variance, np.cumsum(widths)[:-1])
         common = np.repeat([block.mean() or 1.0 for block in blocks], list(widths))
         return np.sqrt(common if isotropic else np.where(variance == 0, common, variance))
+
+
+def _count_rows(rows: Rows, processes: Processes) -> int:
+    """Count the rows of all processes, which have some each, and the same columns."""
+    counts, widths = zip(*processes.gather(rows.shape), strict=True)
+    processes.check_share(counts, "row")
+    if len(set(widths)) > 1:
+        raise DataError(f"the processes' rows have {widths} columns: all need the same")
+    return sum(counts)

@@ -116,27 +116,29 @@ class MotionBounds:
             demonstrated = demonstrated or kinematics.peaks
             kinematics = kinematics.kinematics
         names = [field.name for field in fields(cls)]
-        if unknown := [name for name in given if name not in names]:
-            raise UnknownNameError("bound", unknown[0], "the bounds of a motion", names)
+        for name in given.keys() - {*names}:
+            raise UnknownNameError("bound", name, "the bounds of a motion", names)
         bound = {name: _tighten_bound(name, kinematics, given.get(name)) for name in names}
-        if bound["velocity"].isfinite().any():
-            _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
+        _warn_of_missing_limits(kinematics, bound, given)
         bound |= _complete_rates(bound, demonstrated)
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
 
 
-def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None:
+def _warn_of_missing_limits(
+    kinematics: Kinematics, bound: Mapping[str, Tensor], given: Mapping[str, Any]
+) -> None:
     """Warn of joints of which neither the robot nor the user gives position and speed."""
-    known = kinematics.lower.isfinite() & False
-    if given:
-        known = torch.stack([bound.isfinite() for bound in given]).all(0)
+    chosen = [bound[name] for name in ("lower", "upper", "velocity") if name in given]
+    known = torch.zeros_like(bound["lower"], dtype=torch.bool)
+    if chosen:
+        known = torch.stack(chosen).isfinite().all(0)
     lacking = set(kinematics.without_limits).difference(kinematics.doubtful)
     missing = [
         name
         for name, there in zip(kinematics.joint_names, known, strict=True)
         if name in lacking and not there
     ]
-    if missing:
+    if missing and bound["velocity"].isfinite().any():
         warnings.warn(
             "the description of the robot has no limits of position or speed, or none that fit "
             f"together, of the joints {missing}: complete the URDF, or give lower, upper and "

@@ -454,12 +454,7 @@ def _joint_vector(
 ) -> tuple[list[str], dict[str, float]]:
     """Names of the joint vector, and where all other actuated joints stand."""
     columns = [*_match_names(model, _names("joints", joints or ()), coordinates)]
-    matches = _match_names(model, locked).items()
-    fixed = {
-        name: float(locked[key]) for name, key in matches if name == key or name not in columns
-    }
-    if not all(map(math.isfinite, fixed.values())):
-        raise DataError(f"joints are locked at finite numbers, got {dict(locked)}")
+    fixed = _locked_positions(model, locked, columns)
     if joints is None:
         columns = [name for name in model.actuated_joints if name not in fixed]
     columns = [*dict.fromkeys((*columns, *coordinates))]
@@ -467,6 +462,19 @@ def _joint_vector(
         raise DataError(f"joint {name!r} is both in the joint vector and locked")
     still = (name for name in model.actuated_joints if name not in columns)
     return columns, {name: fixed.get(name, 0.0) for name in still}
+
+
+def _locked_positions(
+    model: UrdfModel, locked: Mapping[str, float], columns: Collection[str]
+) -> dict[str, float]:
+    """Read where joints stand that are named, or fit a pattern and are not in ``columns``."""
+    matches = _match_names(model, locked).items()
+    fixed = {
+        name: float(locked[key]) for name, key in matches if name == key or name not in columns
+    }
+    if not all(map(math.isfinite, fixed.values())):
+        raise DataError(f"joints are locked at finite numbers, got {dict(locked)}")
+    return fixed
 
 
 def _match_names(
@@ -625,11 +633,12 @@ def _limits(
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
     rows |= {name: [getattr(model.joint[name], key) for key in LIMITS] for name in moving}
     without = {name for name in moving if model.joint[name].lacks_limits}
-    for joint in model.movable.values():
-        if joint.mimic is not None and not _limit_leader(model, joint, rows, moving):
+    followers = [joint for joint in model.movable.values() if joint.mimic is not None]
+    for joint in followers:
+        if not _limit_leader(model, joint, rows, moving):
             without.add(model.leader(joint.name).joint)
     limits = torch.tensor(list(rows.values()), dtype=torch.float64)
-    return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
+    return limits.reshape(-1, 5).T, tuple(sorted(without, key=names.index))
 
 
 def _limit_leader(

@@ -349,20 +349,26 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
     Without a range ``<limit>`` gives effort and velocity alone.
     """
     given: dict[str, str] = getattr(element.find("limit"), "attrib", {})
+    limits, doubts = _rates(given)
+    if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
+        ends = {key: _number(given.get(key, 0.0)) for key in ("lower", "upper")}
+        # CAD programs write zeros where nobody has filled in anything
+        if ends["lower"] < ends["upper"] or (ends["lower"] == ends["upper"] and not doubts):
+            limits |= ends
+        else:
+            doubts.append(" ".join(f'{key}="{given.get(key, 0)}"' for key in ends))
+    return limits | {"doubts": tuple(doubts)}
+
+
+def _rates(given: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
+    """Read velocity, acceleration and jerk, and what of them cannot be."""
     keys = ("velocity", "acceleration", "deceleration", "jerk")
     rates = {key: _number(given.get(key, math.inf)) for key in keys}
     doubts = [f'{key}="{given[key][:20]}"' for key in keys if not rates[key] > 0]
-    limits: dict[str, Any] = {key: rate for key, rate in rates.items() if rate > 0}
+    limits = {key: rate for key, rate in rates.items() if rate > 0}
     slowing = limits.pop("deceleration", math.inf)
     limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
-    if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
-        low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
-        # CAD programs write zeros where nobody has filled in anything
-        if low < high or (low == high and not doubts):
-            limits |= {"lower": low, "upper": high}
-        else:
-            doubts.append(f'lower="{given.get("lower", 0)}" upper="{given.get("upper", 0)}"')
-    return limits | {"doubts": tuple(doubts)}
+    return limits, doubts
 
 
 def _number(text: str | float) -> float:

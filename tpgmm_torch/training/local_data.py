@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -19,7 +19,7 @@ from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = [
-    "Expected", "Motion", "at_phases", "constant_columns", "like", "local_data", "rows_of",
+    "Expected", "Motion", "at_phases", "constant_columns", "like", "local_data", "match_rows",
 ]  # fmt: skip
 
 #: The local coordinates (T, D_j) of operator j that are expected at times (T,).
@@ -113,10 +113,14 @@ def local_data(
         If a demonstration has not the robot's joints.
     """
     motions = [Motion.of(one, kinematics, holds) for one in demonstrations]
+    seen = [[motion.coordinates(one, kinematics) for one in operators] for motion in motions]
+    side = expected or like(seen[0])
+    rows = [
+        match_rows(motion, local, operators, kinematics, side)
+        for motion, local in zip(motions, seen, strict=True)
+    ]
     if expected is not None:
-        return list(rows_of(motions, operators, kinematics, expected))
-    first = like([motions[0].coordinates(one, kinematics) for one in operators])
-    rows = list(rows_of(motions, operators, kinematics, first))
+        return rows
     together = torch.cat(rows)
     low, high = together.aminmax(dim=0)
     mask = constant_columns(low, high, operators, kinematics)
@@ -124,37 +128,41 @@ def local_data(
     return list(together.split([len(row) for row in rows]))
 
 
-def rows_of(
-    motions: Iterable[Motion],
+def match_rows(
+    motion: Motion,
+    local: Sequence[Tensor],
     operators: Sequence[Operator],
     kinematics: Kinematics,
     expected: Expected,
-) -> Iterator[Tensor]:
-    """Rows of time and local coordinates of motions, one after the other.
+) -> Tensor:
+    """Join time and local coordinates of a motion, quaternions on the side of what is expected.
 
     Parameters
     ----------
-    motions : iterable of Motion
+    motion : Motion
+        Whose time counts.
+    local : sequence of Tensor of shape (T_m, D_j)
+        Its coordinates, as each of the ``operators`` sees them.
     operators : sequence of Operator
+        Say where quaternions are.
     kinematics : Kinematics
+        On which the operators act.
     expected : callable
-        Quaternions come to the side of what it says.
+        Says on which side quaternions are.
 
-    Yields
-    ------
+    Returns
+    -------
     Tensor of shape (T_m, sum_j (1 + D_j))
     """
-    for motion in motions:
-        blocks: list[Tensor] = []
-        for j, operator in enumerate(operators):
-            block = motion.coordinates(operator, kinematics)
-            template, sign = expected(j, motion.time), torch.ones_like(block[0])
-            for start in operator.quaternion_starts(kinematics):
-                columns = slice(start, start + 4)
-                agreement = (block[:, columns] * template[:, columns]).sum()
-                sign[columns] = quaternions.hemisphere_sign(agreement)
-            blocks += [motion.time[:, None], block * sign]
-        yield torch.cat(blocks, dim=1)
+    blocks: list[Tensor] = []
+    for j, (operator, block) in enumerate(zip(operators, local, strict=True)):
+        template, sign = expected(j, motion.time), torch.ones_like(block[0])
+        for start in operator.quaternion_starts(kinematics):
+            columns = slice(start, start + 4)
+            agreement = (block[:, columns] * template[:, columns]).sum()
+            sign[columns] = quaternions.hemisphere_sign(agreement)
+        blocks += [motion.time[:, None], block * sign]
+    return torch.cat(blocks, dim=1)
 
 
 def like(templates: Sequence[Tensor]) -> Expected:

@@ -22,7 +22,13 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import equivalent_rows
 from tpgmm_torch.training.force_axes import with_force_axes
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, like, rows_of
+from tpgmm_torch.training.local_data import (
+    Motion,
+    at_phases,
+    constant_columns,
+    like,
+    match_rows,
+)
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import block_widths
 
@@ -156,13 +162,7 @@ def _check_alike(first: Demonstration | None, processes: Processes) -> None:
         joints = list(first.joint_names or [f"{first.n_joints} without names"])
         text = f"joints {joints}, frames {sorted(first.frames)}"
     texts = processes.gather(text)
-    if "" in texts:
-        without = [rank for rank, text in enumerate(texts) if not text]
-        where = f" in process(es) {without} of {processes.count}" if processes.count > 1 else ""
-        raise DataError(
-            f"there are no demonstrations, X is empty{where}: "
-            "expected at least one demonstration"
-        )
+    processes.check_share(texts, "demonstration")
     for rank, other in enumerate(texts):
         if other != texts[0]:
             raise DataError(
@@ -204,19 +204,24 @@ def read_rows(
     motions = [Motion.of(one, kinematics, holds) for one in head]
     completed = with_mean_orientations(with_force_axes(operators, motions), motions, kinematics)
     operators = processes.gather(completed)[0]
-    shown = processes.gather(
-        [motions[0].coordinates(one, kinematics).cpu() for one in operators]
-    )
-    expected = like([block.to(kinematics.lower) for block in shown[0]])
     following = chain.from_iterable(chain([later or ()], walk))
     all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
-    each = rows_of(all_motions, operators, kinematics, expected)
-    stored, edges = _store_rows((rows.cpu().numpy() for rows in each), alone)
-    first = _remove_rounding(stored, edges[1], operators, kinematics, processes)
+    seen = ((m, [m.coordinates(one, kinematics) for one in operators]) for m in all_motions)
+    first = next(seen)
+    shown = processes.gather([block.cpu() for block in first[1]])[0]
+    side = like([block.to(kinematics.lower) for block in shown])
+    each = (
+        match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
+        for motion, blocks in chain([first], seen)
+    )
+    stored, edges = _store_rows(each, alone)
+    reference = _remove_rounding(stored, edges[1], operators, kinematics, processes)
     time, number = _typical_time(stored, edges, processes)
     time, own = time.to(kinematics.lower), tuple(operators)
     rows = TrainingRows(stored, 1, time, number, own, holds, processes, stored, edges)
-    return _group_instants(rows, first, responsibilities, block_widths(operators, kinematics))
+    return _group_instants(
+        rows, reference, responsibilities, block_widths(operators, kinematics)
+    )
 
 
 def _store_rows(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
