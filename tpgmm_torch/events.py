@@ -83,7 +83,7 @@ class Boundary:
 def find_boundaries(
     demonstration: Demonstration, robot: Any = None, *, margin: float = 0.05
 ) -> list[Boundary]:
-    """All instants at which one part may end and another begin, in the order of time.
+    """Find all instants at which one part may end and another begin, in order.
 
     A stop at which a gripper moves or something is taken or let go is one boundary with these.
 
@@ -120,7 +120,7 @@ def find_boundaries(
 
 
 def find_gripper_changes(demonstration: Demonstration) -> list[Boundary]:
-    """Each closing and opening of each gripper, known by the names of the signals.
+    """Find each closing and opening of each gripper, known by the names of the signals.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def find_gripper_changes(demonstration: Demonstration) -> list[Boundary]:
 
 
 def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Boundary]:
-    """When objects that were recorded over time are taken and let go, or begin to move.
+    """Find when objects that were recorded over time are taken and let go, or begin to move.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def find_stops(
     rest: float = 0.15,
     motion: float = 0.5,
 ) -> list[Boundary]:
-    """When the whole robot comes to rest between two motions; rhythms go on.
+    """Find when the whole robot comes to rest between two motions; rhythms go on.
 
     A rhythm has no speed where it turns back either, but does not stay there: how long there is
     next to none, of the time in which there is little, tells them apart.
@@ -224,13 +224,13 @@ def find_stops(
 
 
 def _crossing(time: Array, speed: Array, below: int, way: int, limit: float) -> float:
-    """When a limit is crossed between a step that is below it and the one before or after."""
+    """Find when a limit is crossed between a step below it and the one before or after."""
     pair = [below, below + way]
     return float(np.interp(limit, speed[pair], time[pair]))
 
 
 def _robot_speed(demonstration: Demonstration, robot: Any) -> Array:
-    """Of all links together, of the joints but for grippers without links, smoothed, (T,)."""
+    """Compute the speed of all links together, or of joints but for grippers, (T,)."""
     if robot is not None and robot.links:
         values = _link_coordinates(demonstration, robot)
     else:
@@ -251,7 +251,7 @@ def _link_coordinates(demonstration: Demonstration, robot: Any) -> Array:
 
 
 def smooth_speed(values: Array, time: Array, length: float) -> Array:
-    """Norm of the rates of change (T,) of values (T, n), as means over a length of time [s]."""
+    """Compute the norm of rates of change (T,) of values (T, n), over a length of time [s]."""
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     rates = np.gradient(values, time, axis=0)
     smooth = uniform_filter1d(rates, 2 * half + 1, axis=0, mode="nearest")
@@ -262,7 +262,7 @@ def smooth_speed(values: Array, time: Array, length: float) -> Array:
 def move_start(
     position: Array, time: Array, *, left: float = 0.02, away: float = 0.1
 ) -> tuple[float, float]:
-    """When an object with ``position`` (T, 3) at ``time`` leaves its place, and the confidence.
+    """Find when an object with ``position`` (T, 3) leaves its place, and the confidence.
 
     It is the last instant at which the object was within the share ``left`` of its largest
     distance from where it lay, before it came to ``away``. The confidence is the product of
@@ -283,14 +283,14 @@ def move_start(
 
 
 def without_spikes(values: Array, time: Array, length: float = 0.1) -> Array:
-    """Medians of signals ``values`` (T, n) at ``time`` (T,) over a ``length`` of time [s]."""
+    """Filter signals ``values`` (T, n) at ``time`` (T,) by medians over a ``length`` [s]."""
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     filtered: Array = median_filter(values, size=(2 * half + 1, 1), mode="nearest")
     return filtered
 
 
 def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
-    """Columns of the signals of each gripper; the fingers of one side's hand are one.
+    """Group signals by gripper; the fingers of one side's hand are one.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]:
-    """All changes of signals between their two levels.
+    """Find all changes of signals between their two levels.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]
 
 
 def _principal(values: Array) -> Array:
-    """One signal of shape (T,) for several (T, n): what most of them do, they do."""
+    """Compute one signal of shape (T,) for several (T, n): what most of them do."""
     if values.shape[1] == 1:
         return values[:, 0]
     weights = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)[2][0]
@@ -354,7 +354,7 @@ def _principal(values: Array) -> Array:
 
 
 def between_levels(values: Array) -> tuple[Array, float]:
-    """Signals ``values`` (T, n) from their low level (0) to the high one (1), and the contrast.
+    """Scale signals ``values`` (T, n) from the low level (0) to the high one (1); contrast.
 
     Several count as one, their first principal component. Its levels are the medians of the two
     classes of Otsu [1]_. The contrast is one less twice the standard deviation within the
@@ -376,7 +376,7 @@ def between_levels(values: Array) -> tuple[Array, float]:
 
 
 def _levels(values: Array) -> tuple[float, float, float]:
-    """Medians of the two classes that differ most, and the deviation within them."""
+    """Find medians of the two classes that differ most, and the deviation within them."""
     ordered = np.sort(values)
     count = np.arange(1, len(ordered))
     sums = ordered.cumsum()
@@ -390,7 +390,7 @@ def _levels(values: Array) -> tuple[float, float, float]:
 def crossing_time(
     time: Array, share: Array, start: int, stop: int, edge: str
 ) -> tuple[float, float]:
-    """When a signal passes ``ON`` at an edge [s], and how long that took from ``1 - ON``.
+    """Find when a signal passes ``ON`` at an edge [s], and how long that took.
 
     Parameters
     ----------
@@ -411,7 +411,7 @@ def crossing_time(
 
 
 def high_stretches(values: Array, on: float, off: float) -> list[tuple[int, int]]:
-    """Stretches that begin where values reach ``on`` and last until they are below ``off``.
+    """Find stretches from where values reach ``on`` until they are below ``off``.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
 
     @abc.abstractmethod
     def _path(self, demonstration: Demonstration) -> Array:
-        """Instants of a demonstration at each time of the grid [s]."""
+        """Compute instants of a demonstration at each time of the grid [s]."""
 
     def _start(self, X: Any) -> list[Demonstration]:
         """Check parameters and demonstrations, as each ``fit`` does first."""

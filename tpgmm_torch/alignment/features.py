@@ -26,7 +26,7 @@ WEIGHTS = {"speed": 5.0, "directions": 4.5}
 
 
 def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[int]]:
-    """Columns of the joints that hold unit quaternions, as those of recorded poses do.
+    """Locate unit quaternions among the joints, as those of recorded poses.
 
     Returns
     -------
@@ -137,7 +137,7 @@ class AlignmentFeatures:
         return tuple(self.columns)
 
     def others(self, demonstrations: Sequence[Demonstration]) -> Self | None:
-        """The groups that are not in use, seen from frames left aside; None if none changes.
+        """Fit the groups that are not in use, seen from no frame; None if none changes.
 
         Whether a matching by some features is right shows in others.
         """
@@ -149,7 +149,7 @@ class AlignmentFeatures:
             return None
 
     def __call__(self, demonstration: Demonstration) -> Array:
-        """The features of a demonstration, shape (T, D)."""
+        """Compute the features of a demonstration, shape (T, D)."""
         groups = _groups(demonstration, self.robot)
         for name in self.names:
             if name not in groups:
@@ -161,7 +161,7 @@ class AlignmentFeatures:
 
 
 def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
-    """All feature groups of a demonstration, unscaled, each of shape (T, d)."""
+    """Compute all feature groups of a demonstration, unscaled, each of shape (T, d)."""
     joints = demonstration.joints
     quaternion = quaternion_columns(demonstration, robot)
     others = np.setdiff1d(np.arange(demonstration.n_joints), np.ravel(quaternion))
@@ -186,7 +186,7 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
 
 
 def _velocity(values: Array, demonstration: Demonstration) -> Array:
-    """Smoothed rates of change, zero where values are constant, shape (T, d)."""
+    """Compute smoothed rates of change, zero where values are constant, shape (T, d)."""
     time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
@@ -196,12 +196,12 @@ def _velocity(values: Array, demonstration: Demonstration) -> Array:
 
 
 def _varying(deviation: Array, size: Array) -> NDArray[np.bool_]:
-    """Whether columns vary beyond what rounding leaves of their sizes."""
+    """Check whether columns vary beyond what rounding leaves of their sizes."""
     return np.asarray(deviation > np.finfo(np.float64).eps ** 0.5 * size)
 
 
 def _relative_speed(velocity: Array) -> Array:
-    """Speed over its root mean square, which may be zero, shape (T, 1)."""
+    """Divide the speed by its root mean square, which may be zero, shape (T, 1)."""
     speed = np.linalg.norm(velocity, axis=1, keepdims=True)
     usual = np.sqrt((speed**2).mean())
     return speed / usual if usual > 0 else speed

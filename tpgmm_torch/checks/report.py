@@ -72,15 +72,15 @@ class Report:
 
     @classmethod
     def of(cls, findings: Iterable[Finding], subject: str) -> Report:
-        """The report with errors first."""
+        """Make a report with errors first."""
         return cls(tuple(sorted(findings, key=lambda f: not f.impossible)), subject)
 
     def __iter__(self) -> Iterator[Finding]:
-        """One finding after the other."""
+        """Iterate over the findings."""
         return iter(self.findings)
 
     def __len__(self) -> int:
-        """Number of findings."""
+        """Count the findings."""
         return len(self.findings)
 
     def __str__(self) -> str:
@@ -92,7 +92,7 @@ class Report:
         return f"{self.subject}: {one} {worst}: {items}"
 
     def errors(self) -> tuple[Finding, ...]:
-        """Findings that are impossible."""
+        """Return the findings that are impossible."""
         return tuple(finding for finding in self if finding.impossible)
 
     def act(self, packages: tuple[str, ...] = ()) -> Report:
@@ -127,7 +127,7 @@ class Report:
 
 
 def shorten_list(items: Sequence[str], most: int = 3) -> str:
-    """The first of some ``items``, ``most`` of them, and how many more there are.
+    """Name the first of some ``items``, ``most`` of them, and how many more there are.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def shorten_list(items: Sequence[str], most: int = 3) -> str:
 
 
 def in_columns(lines: Sequence[Sequence[str]]) -> str:
-    """Lines of cells as text, with columns as wide as they need.
+    """Format lines of cells in columns as wide as they need.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ def check_situations(
 
 
 def _describe_batch(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
-    """Names of the batch, and of one of its situations."""
+    """Name the batch, and one of its situations."""
     if len(batch) == 1 and batch[0] > 1:
         return f"{batch[0]} situations", f"situation {worst[0]}, "
     return "the situation", ""
@@ -91,7 +91,7 @@ def _unit(kinematics: Kinematics, joint: int, value: float, label: str) -> Findi
 
 
 def _time(times: Tensor, learned: Tensor) -> Iterator[Finding]:
-    """Times that lie before or after the skill by more than it lasts."""
+    """Find times that lie before or after the skill by more than it lasts."""
     begin, end = float(learned[0]), float(learned[-1])
     first, last = float(times.min()), float(times.max())
     if first < 2 * begin - end or last > 2 * end - begin:

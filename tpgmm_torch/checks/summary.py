@@ -77,7 +77,7 @@ class Region:
         return cls(mean.tolist(), ((1 + 1 / n) * covariance).tolist())
 
     def distance(self, vectors: Array) -> Array:
-        """Mahalanobis distance of vectors (..., D), about 1 at the edge of the likely.
+        """Compute the Mahalanobis distance of vectors (..., D), about 1 at the likely edge.
 
         ``sqrt(d^2 / (D + 2 sqrt(2 D)))``: d^2 of D numbers has about the mean D, and the
         standard deviation sqrt(2 D).
@@ -162,7 +162,7 @@ class FrameSummary:
         )
 
     def rotation_vectors(self, orientations: Array) -> Array:
-        """Rotation vectors [rad] from the mean to orientations (..., 4), the shorter way."""
+        """Compute rotation vectors [rad] from the mean to orientations (..., 4)."""
         return _rotation_vectors(np.array(self.orientation), orientations)
 
 
@@ -261,7 +261,7 @@ class TrainingSummary:
         )
 
     def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
-        """Distance of situations from the demonstrations, in units of the furthest of these.
+        """Measure the distance from the demonstrations, in units of the furthest of these.
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
         each frame's orientation from their regions, there where the skill begins, divided by
@@ -288,7 +288,7 @@ class TrainingSummary:
     def start_frames(
         self, joints: Any, kinematics: Kinematics, given: Collection[str] = ()
     ) -> dict[str, Frame]:
-        """The frames that follow from a start posture: the poses of links at the start.
+        """Compute the frames that follow from a start posture: poses of links.
 
         Parameters
         ----------
@@ -348,12 +348,12 @@ class TrainingSummary:
         return found
 
     def config(self) -> dict[str, Any]:
-        """All of it, ready for JSON."""
+        """Describe all of it, ready for JSON."""
         return asdict(self) | {"joint_names": list(self.joint_names)}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], kinematics: Kinematics) -> Self:
-        """The inverse of :meth:`config`, for a model of these kinematics.
+        """Invert :meth:`config`, for a model of these kinematics.
 
         Raises
         ------
@@ -383,7 +383,7 @@ class TrainingSummary:
     def _distances(
         self, joints: Any, frames: Mapping[str, Frame]
     ) -> dict[tuple[str, str], Array]:
-        """Distances (...) of situations from each region, by its kind and frame."""
+        """Compute distances (...) of situations from each region, by its kind and frame."""
         found: dict[tuple[str, str], Array] = {}
         if joints is not None and len(self.compared):
             found["start", ""] = self.start.distance(_rows(joints)[..., list(self.compared)])
@@ -448,7 +448,7 @@ def _median_events(episodes: Sequence[EpisodeSummary]) -> dict[str, float]:
 
 
 def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
-    """The largest distance of a demonstration from the regions of the others."""
+    """Compute the largest distance of a demonstration from the regions of the others."""
     n = len(vectors[0][1])
     if n <= FEWEST:
         return 1.0
@@ -465,7 +465,7 @@ def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
 
 
 def _norm(distances: Iterable[Array]) -> Array:
-    """The 4-norm of distances that broadcast; NaN does not count.
+    """Compute the 4-norm of distances that broadcast; NaN does not count.
 
     It is nearly the largest, and more where several are large.
     """
@@ -481,7 +481,7 @@ def _rows(joints: Any) -> Array:
 
 
 def _same(pose: Frame, other: Frame) -> bool:
-    """Whether poses (N,) are equal up to rounding."""
+    """Check whether poses (N,) are equal up to rounding."""
     other = other.to(pose.position)
     turn = quaternions.match_hemisphere(other.orientation, pose.orientation)
     differences = as_array(pose.position - other.position), as_array(pose.orientation - turn)
@@ -492,7 +492,7 @@ def _same(pose: Frame, other: Frame) -> bool:
 def _outside(
     names: Sequence[str], low: Array, high: Array, values: Array
 ) -> tuple[str, tuple[str, ...]]:
-    """Description and names of the coordinates that are outside a range, the furthest first."""
+    """Describe and name the coordinates that are outside a range, the furthest first."""
     excess = np.maximum(low - values, values - high)
     odd = [i for i in np.argsort(-excess) if excess[i] > 0]
     places = [f"{names[i]} = {values[i]:.4g}, shown {low[i]:.4g} to {high[i]:.4g}" for i in odd]
@@ -501,7 +501,7 @@ def _outside(
 
 
 def _first_poses(paths: Sequence[PathSummary]) -> Frame:
-    """The first pose of a frame in each demonstration, (N,)."""
+    """Collect the first pose of a frame in each demonstration, (N,)."""
     positions = np.stack([path.position for path in paths])
     return Frame(positions, np.stack([path.orientation for path in paths]))
 

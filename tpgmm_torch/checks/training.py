@@ -135,7 +135,7 @@ class EpisodeSummary:
 
 
 def differing(postures: Array) -> Array:
-    """At most ``POSTURES`` postures, each as far as can be from those before it.
+    """Select at most ``POSTURES`` postures, each as far as can be from those before it.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def differing(postures: Array) -> Array:
 def summarize(
     demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
 ) -> list[EpisodeSummary]:
-    """Summaries of demonstrations, with the joints in the order of the kinematics.
+    """Summarise demonstrations, with the joints in the order of the kinematics.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def summarize(
 def in_order(
     demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
 ) -> list[Demonstration]:
-    """Demonstrations with the joints of the kinematics, in its order.
+    """Bring the joints of demonstrations into the order of the kinematics.
 
     Raises
     ------
@@ -226,7 +226,7 @@ def check(
 def unit_findings(
     episodes: Sequence[EpisodeSummary], kinematics: Kinematics | None
 ) -> Iterator[Finding]:
-    """Joints beyond the robot's limits, frames hardly in metres, time not in seconds.
+    """Find joints beyond limits, frames hardly in metres, time not in seconds.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def unit_findings(
 
 
 def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Iterator[Finding]:
-    """Joints beyond the limits: in another unit, in another order, or of another robot."""
+    """Find joints beyond the limits: in another unit or order, or of another robot."""
     low, high = _joint_ranges(episodes)
     limits = np.stack((as_array(kinematics.lower), as_array(kinematics.upper)))
     allowed = BEYOND * np.minimum(limits[1] - limits[0], 1.0)
@@ -303,7 +303,7 @@ def _joint_ranges(episodes: Sequence[EpisodeSummary]) -> tuple[Array, Array]:
 def ranges(
     names: Sequence[str], columns: Sequence[int], low: Array, high: Array, limits: Array
 ) -> str:
-    """Ranges of some joints in words, beside their limits (2, n_joints) where there are any.
+    """Describe ranges of some joints, beside their limits (2, n_joints) where there are any.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ def ranges(
 
 
 def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
-    """Demonstrations that show different things at one time.
+    """Find demonstrations that show different things at one time.
 
     Segments of the skill in its time, such as corrections, begin later than most and end
     within them; they are on the clock.
@@ -347,7 +347,7 @@ def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
 def _freedom(
     count: int, operators: Sequence[Operator], kinematics: Kinematics, correlated: bool
 ) -> Iterator[Finding]:
-    """Too few demonstrations to estimate variances and correlations."""
+    """Find too few demonstrations to estimate variances and correlations."""
     widest = max((operator.dimension(kinematics) for operator in operators), default=0)
     placed = widest > 2 and frame_names(operators, kinematics)
     remedy = "Show the skill 5 times or more, from other starts and places"
@@ -367,7 +367,7 @@ def _freedom(
 def _operators_without_effect(
     operators: Sequence[Operator], kinematics: Kinematics, holds: Sequence[Hold]
 ) -> Iterator[Finding]:
-    """Operators that constrain no joint: the objects they are about never move with a link."""
+    """Find operators that constrain no joint: their objects never move with a link."""
     links = {*kinematics.links}
     moved = links.union(hold.frame for hold in holds)
     inactive = [

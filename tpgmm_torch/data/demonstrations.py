@@ -62,7 +62,7 @@ def _check_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dic
 
 
 def _check_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
-    """Wrenches by link, each (T, 6)."""
+    """Check wrenches by link, each (T, 6)."""
     checked = {}
     for link, values in dict(wrenches).items():
         wrench = as_tensor(values, f"the wrench of {link!r}")
@@ -172,7 +172,7 @@ class Demonstration:
         return float(self.time[-1] - self.time[0])
 
     def frame(self, name: str) -> Frame:
-        """The frame of that name.
+        """Return the frame of that name.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class Demonstration:
         return self.frames[name]
 
     def event(self, name: str) -> float:
-        """When the event of that name is [s]; every demonstration has a start and an end.
+        """Return when an event is [s]; every demonstration has a start and an end.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Demonstration:
         return known[name]
 
     def at_steps(self, chosen: slice | Tensor) -> Demonstration:
-        """The demonstration at some of its time steps, with the events between them.
+        """Cut the demonstration to some time steps, with the events between them.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class Demonstration:
         )
 
     def reorder(self, joint_names: Sequence[str]) -> Demonstration:
-        """The same demonstration with its joint columns in the order of ``joint_names``.
+        """Bring the joints into the order of ``joint_names``.
 
         Other columns are left out. Without names, the order is trusted.
 
@@ -297,7 +297,7 @@ class Situation:
 
     @classmethod
     def of(cls, demonstration: Demonstration, time: Any = None) -> Situation:
-        """The situation that a demonstration was made in: its start posture and its frames.
+        """Return the situation of a demonstration: its start posture and its frames.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class Situation:
         )
 
     def reorder(self, joint_names: Sequence[str]) -> Situation:
-        """The same situation with its joints in the order of ``joint_names``.
+        """Bring the joints into the order of ``joint_names``.
 
         Other joints are left out. Without names, the order is trusted.
 
@@ -335,7 +335,7 @@ class Situation:
         return f"Situation({len(self.joints)} joints, frames={sorted(self.frames)}{time})"
 
     def frames_at(self, time: Tensor) -> dict[str, Frame]:
-        """The frames, those that move as they are at other times.
+        """Return the frames as they are at other times.
 
         Parameters
         ----------
@@ -357,7 +357,7 @@ class Situation:
 
 
 def _values(joints: Mapping[str, Any]) -> Tensor:
-    """The numbers of joints that are given by name, one behind the other."""
+    """Join the numbers of joints that are given by name."""
     parts = [as_tensor(value, f"joint {name!r}").reshape(-1) for name, value in joints.items()]
     return torch.cat(parts) if parts else torch.empty(0)
 
@@ -365,7 +365,7 @@ def _values(joints: Mapping[str, Any]) -> Tensor:
 def _columns(
     wanted: Sequence[str], present: tuple[str, ...] | None, where: str
 ) -> list[int] | None:
-    """Where the wanted joints stand among those present; None if as they are, or unnamed."""
+    """Find wanted joints among those present; None if as they are, or unnamed."""
     if present is None or present == tuple(wanted):
         return None
     for name in wanted:

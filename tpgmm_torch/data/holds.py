@@ -75,7 +75,7 @@ class Hold:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The hold that a text stands for, ``FRAME@LINK:BEGIN-END``.
+        """Parse a text, ``FRAME@LINK:BEGIN-END``.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class Hold:
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
 
     def retime(self, clock: Callable[[float], float]) -> Self:
-        """The same hold on another clock.
+        """Put the hold on another clock.
 
         Parameters
         ----------
@@ -120,7 +120,7 @@ class Hold:
 def check_holds(
     holds: Iterable[Any], frames: Collection[str], links: Collection[str] | None = None
 ) -> tuple[Hold, ...]:
-    """Holds in the order of their beginnings, checked to be possible.
+    """Check that holds are possible, and sort them by their beginnings.
 
     Parameters
     ----------

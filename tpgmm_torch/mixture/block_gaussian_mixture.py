@@ -174,7 +174,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     def from_parameters(
         cls, weights: Any, means: Sequence[Any], covariances: Sequence[Any], **settings: Any
     ) -> Self:
-        """A fitted mixture from weights (K,), means (K, D_j), covariances (K, D_j, D_j).
+        """Make a mixture of weights (K,), means (K, D_j), covariances (K, D_j, D_j).
 
         Parameters
         ----------
@@ -285,7 +285,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         scale: Tensor,
         rng: RandomState,
     ) -> list[Parameters]:
-        """Where EM begins, in standardised units."""
+        """Choose where EM begins, in standardised units."""
         if start is None:
             own = self.init_params, self.n_init, self.n_components
             return draw_starts(*own, points, family, rng)
@@ -298,7 +298,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return [family.admit(start._parameters().affine(1 / scale, -shift / scale))]
 
     def _rows(self, X: Any) -> Rows:
-        """The rows of X, checked."""
+        """Check the rows of X."""
         rows: Rows = X
         if not isinstance(X, RowFile):
             kinds = [np.float64, np.float32]
@@ -310,7 +310,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return rows
 
     def _widths(self, n_features: int) -> list[int]:
-        """Widths of the blocks, checked against the data."""
+        """Check widths of the blocks against the data."""
         widths = [n_features] if self.blocks is None else list(self.blocks)
         if not all(isinstance(width, Integral) and width > 0 for width in widths):
             raise ShapeError(f"blocks must be positive integers, got {self.blocks!r}")
@@ -322,7 +322,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return list(map(int, widths))
 
     def _family(self, widths: list[int]) -> CovarianceFamily:
-        """The covariances that are admitted, in standardised units."""
+        """Make the family of admitted covariances, in standardised units."""
         shares = np.asarray(self.reg_covar, dtype=np.float64)
         if shares.shape not in ((), (sum(widths),)):
             raise ShapeError(
@@ -347,7 +347,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def score_samples(self, X: Any) -> NDArray[np.floating]:
-        """Log-density of each point.
+        """Compute the log-density of each point.
 
         Parameters
         ----------
@@ -360,11 +360,11 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self._evaluate(X, lambda joint: joint.logsumexp(0))
 
     def score(self, X: Any, y: Any = None) -> float:
-        """Mean log-density of the points X (n_samples, n_features)."""
+        """Compute the mean log-density of the points X (n_samples, n_features)."""
         return float(self.score_samples(X).mean(dtype=np.float64))
 
     def predict_proba(self, X: Any) -> NDArray[np.floating]:
-        """Responsibilities of the components for each point.
+        """Compute responsibilities of the components for each point.
 
         Parameters
         ----------
@@ -377,7 +377,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self._evaluate(X, lambda joint: joint.softmax(0).T)
 
     def predict(self, X: Any) -> NDArray[np.int64]:
-        """Most probable component of each of the points X, shape (n_samples,)."""
+        """Return the most probable component of each of the points X, shape (n_samples,)."""
         return self._evaluate(X, lambda joint: joint.argmax(0))
 
     @property
@@ -394,7 +394,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return k - 1 + k * sum(widths) + covariances[self.covariance_type]
 
     def bic(self, X: Any) -> float:
-        """Bayesian information criterion on X (n_samples, n_features); lower is better."""
+        """Compute the Bayesian information criterion on X (n_samples, n_features)."""
         return -2 * len(X) * self.score(X) + self.n_parameters_ * math.log(len(X))
 
     def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
@@ -425,7 +425,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return np.concatenate(columns, axis=1).astype(self.dtype), labels
 
     def _parameters(self) -> Parameters:
-        """The fitted mixture in float64."""
+        """Return the fitted mixture in float64."""
         if not hasattr(self, "weights_"):
             raise NotFittedError(
                 f"this {type(self).__name__} is not fitted yet; call fit before this method"
@@ -457,7 +457,7 @@ def _width(block: Tensor) -> int:
 
 
 def _on_cpu(X: Any) -> Any:
-    """X as an array if it is a tensor, as it is if not."""
+    """Convert X to an array if it is a tensor."""
     return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
 
 

@@ -28,7 +28,7 @@ __all__ = ["moderated_variances", "shrink", "shrinkage_intensity", "trigamma_inv
 def shrinkage_intensity(
     covariance: Tensor, intensity: float | str, n_samples: Tensor | float
 ) -> Tensor:
-    """The share l by which covariances go towards their diagonals, (...), from 0 to 1.
+    """Compute the share l by which covariances go towards their diagonals, (...).
 
     "auto" is the oracle approximating shrinkage of Chen et al., equation (23), of the
     correlations R, for which the identity that it shrinks to is the diagonal: with
@@ -65,7 +65,7 @@ def shrink(
     *,
     given: int = 0,
 ) -> Tensor:
-    """Covariances moved towards their diagonals, variances of one unit moderated by each other.
+    """Move covariances towards their diagonals, variances of one unit towards each other.
 
     ``C <- (1 - l) C + l diag(C)``, where C is the covariance of what follows the first
     ``given`` columns, given these: how the other columns depend on them stays as it is. Then
@@ -107,7 +107,7 @@ def shrink(
 
 
 def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
-    """Posterior variances under a prior estimated from the variances themselves, (..., G).
+    """Compute posterior variances (..., G) under a prior estimated from them.
 
     With ``s_g^2 ~ sigma_g^2 chi^2_n / n`` and ``1 / sigma_g^2 ~ chi^2_m / (m s_0^2)`` it is
     ``(m s_0^2 + n s_g^2) / (m + n)``: the prior counts like m more degrees of freedom. Mean and
@@ -136,7 +136,7 @@ def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
 
 
 def trigamma_inverse(value: Tensor, n_steps: int = 20) -> Tensor:
-    """The x with ``trigamma(x) = value``, elementwise, of positive values.
+    """Solve ``trigamma(x) = value`` for x, elementwise, of positive values.
 
     By Newton's method on ``1 / trigamma``, which is convex from the start on and converges from
     there (Smyth, appendix); each of ``n_steps`` doubles the number of right digits.

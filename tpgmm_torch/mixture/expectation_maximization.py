@@ -61,7 +61,7 @@ class Parameters:
     covariances: tuple[Tensor, ...]
 
     def affine(self, scale: Tensor, shift: Tensor) -> Parameters:
-        """The mixture of ``scale * x + shift``; scale and shift are of shape (sum D_j,)."""
+        """Compute the mixture of ``scale * x + shift``, both of shape (sum D_j,)."""
         widths = [mean.shape[1] for mean in self.means]
         scales, shifts = scale.split(widths), shift.split(widths)
         means = [m * s + b for m, s, b in zip(self.means, scales, shifts, strict=True)]
@@ -86,7 +86,7 @@ class CovarianceFamily:
     diagonals: tuple[Tensor, ...]
 
     def restrict(self, covariance: Tensor, weights: Tensor) -> Tensor:
-        """The most likely member for scatter matrices (K, D_j, D_j) and weights (K,)."""
+        """Find the most likely member for scatter (K, D_j, D_j) and weights (K,)."""
         diagonal = covariance.diagonal(dim1=1, dim2=2)
         match self.covariance_type:
             case "tied":
@@ -121,7 +121,7 @@ class CovarianceFamily:
 
 
 def whiten(parameters: Parameters) -> tuple[list[Tensor], Tensor]:
-    """Maps to whitened coordinates ``L_k^-1 (x_j - mu_kj)``, and log-densities at the means.
+    """Compute maps to whitened ``L_k^-1 (x_j - mu_kj)``, and log-densities at the means.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ class Expectation:
 
 
 def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) -> Expectation:
-    """One pass over the points, in which each chunk meets only the components near it in time.
+    """Pass over the points, each chunk with the components near it in time.
 
     Within a chunk no log-density of component k exceeds ``ub_k``, that at its mean less
     ``sum_j gap_kj^2 / 2 sigma_kj^2``, where ``gap_kj`` is how far the mean lies from the
@@ -266,7 +266,7 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
 
 
 def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expectation:
-    """The pass in which each point belongs to one component.
+    """Pass over the points, each of which belongs to one component.
 
     Parameters
     ----------
@@ -319,14 +319,14 @@ class _Sums:
     def expectation(
         self, parameters: Parameters, maps: Sequence[Tensor], points: Points, least: Tensor
     ) -> Expectation:
-        """The sums of all processes."""
+        """Add up the sums of all processes."""
         mass, total, *sums = points.processes.sum(self.mass, self.total, *self.moments)
         rounded, bound = [own.double() for own in maps], float(total) / points.total
         return Expectation(parameters, rounded, mass, sums, bound, least)
 
 
 def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
-    """Upper bounds of the log-densities of the components in each chunk, (n_chunks, K)."""
+    """Bound the log-densities of the components in each chunk, (n_chunks, K)."""
     mean = torch.stack([mean[:, 0] for mean in parameters.means], 1)
     variance = torch.stack([covariance[:, 0, 0] for covariance in parameters.covariances], 1)
     low, high = spans[:, :, None].unbind(1)
@@ -335,7 +335,7 @@ def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
 
 
 def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -> Parameters:
-    """The mixture that the responsibilities ask for.
+    """Compute the mixture that the responsibilities ask for.
 
     Parameters
     ----------
@@ -372,7 +372,7 @@ def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -
 def dead_components(
     expectation: Expectation, family: CovarianceFamily, points: Points
 ) -> Tensor:
-    """Which components have lost their data, shape (K,).
+    """Find components that have lost their data, shape (K,).
 
     Either nothing is left of its mass, or at most two points are, without any spread
     beyond the regularisation, though there is data enough to give each component more.
@@ -432,7 +432,7 @@ def restart_components(
 
 
 def _worst(parameters: Parameters, points: Points, count: int) -> Tensor:
-    """The points of lowest density (count, sum D_j), worst first."""
+    """Find the points of lowest density (count, sum D_j), worst first."""
     maps, peaks = whiten(parameters)
     maps, peaks = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
     worst = peaks.new_zeros(0, 1 + len(points.values))

@@ -30,7 +30,7 @@ def draw_starts(
     family: CovarianceFamily,
     rng: RandomState,
 ) -> list[Parameters]:
-    """So many starts: the Gaussians of the points that each component was given.
+    """Draw starts: the Gaussians of the points that each component was given.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def draw_starts(
 def _bins_along_time(
     n_starts: int, n_bins: int, points: Points, rng: RandomState
 ) -> list[Labeller]:
-    """Equal bins, and bins of random sizes from the second start on."""
+    """Make equal bins, and bins of random sizes from the second start on."""
     # groups stay together, unless they are too few
     group_size = points.group_size if points.total // points.group_size >= n_bins else 1
     sample, numbers = points.sample(group_size)
@@ -88,7 +88,7 @@ def _bins_along_time(
 
 
 def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> list[int]:
-    """Sizes of bins that together hold ``n_points`` points, each at least one.
+    """Divide ``n_points`` points into bins, each of at least one.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> lis
 
 
 def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int) -> Labeller:
-    """Bins along time whose limits are quantiles of a sample of the points.
+    """Bin along time, with quantiles of a sample of the points as limits.
 
     They hold points in the given proportions: exactly, if the sample is all points. Points of
     equal time are in the order of their numbers, so that no bin is empty.
@@ -137,7 +137,7 @@ def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int)
 
 
 def nearest(centers: Tensor) -> Labeller:
-    """The nearest of some centers (K, sum D_j)."""
+    """Label points by the nearest of some centers (K, sum D_j)."""
     # differences, not norms and products: a center is nearest to itself, rounding or not
     mode = "donot_use_mm_for_euclid_dist"
     return lambda rows, _: torch.cdist(rows.to(centers), centers, compute_mode=mode).argmin(1)

@@ -79,7 +79,7 @@ class Points:
         self.spans = torch.stack(spans).double()
 
     def __iter__(self) -> Iterator[Chunk]:
-        """One pass over the rows of this process."""
+        """Pass once over the rows of this process."""
         if isinstance(self._rows, np.ndarray):
             self._kept = self._kept or list(self._pass(self._rows, len(self._rows)))
             return iter(self._kept)
@@ -102,15 +102,15 @@ class Points:
                 yield chunk, numbers[first : first + len(own)]
 
     def standardize(self, rows: NDArray[np.floating]) -> Tensor:
-        """Rows (n, sum D_j) of the data in standardised units, in float64."""
+        """Standardise rows (n, sum D_j) of the data, in float64."""
         return (torch.from_numpy(rows).to(self.shift) - self.shift).div_(self.scale)
 
     def blocks(self, chunk: Tensor) -> tuple[Tensor, ...]:
-        """The blocks (x_j; 1) of a chunk, each of shape (D_j + 1, n)."""
+        """Split a chunk into blocks (x_j; 1), each of shape (D_j + 1, n)."""
         return chunk.split([width + 1 for width in self.widths])
 
     def sample(self, every: int = 1) -> tuple[Tensor, Tensor]:
-        """At most ``FILE_ROWS`` rows of all processes; all of them where they are no more.
+        """Draw at most ``FILE_ROWS`` rows of all processes; all where they are no more.
 
         Parameters
         ----------

@@ -46,7 +46,7 @@ class RowFile:
 
     @classmethod
     def of(cls, batches: Iterable[Any]) -> Self:
-        """The rows of batches of shape (n, n_features), checked as they are read once.
+        """Return the rows of batches of shape (n, n_features), checked as they are read once.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ Rows = NDArray[np.floating[Any]] | RowFile
 
 
 def pieces(rows: Rows) -> Iterator[NDArray[np.float64]]:
-    """All rows in float64, in blocks of as many as are read from a file at once.
+    """Yield all rows in float64, in blocks of as many as are read from a file at once.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class ColumnMoments:
 
     @classmethod
     def of(cls, rows: Rows, processes: Processes = ALONE) -> ColumnMoments:
-        """Moments of the rows (n, n_features) of all processes.
+        """Return moments of the rows (n, n_features) of all processes.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class ColumnMoments:
         return cls(count, mean, scatter, low, high)
 
     def scales(self, widths: Sequence[int], *, isotropic: bool) -> Array:
-        """The units (n_features,) in which each column, or block, has standard deviation 1.
+        """Compute units (n_features,) in which columns, or blocks, have standard deviation 1.
 
         A constant column takes the mean variance of its block, or 1 where that is zero too.
 

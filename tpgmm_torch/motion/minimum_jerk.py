@@ -6,7 +6,7 @@ __all__ = ["minimum_jerk"]
 
 
 def minimum_jerk(fraction: Tensor) -> Tensor:
-    """Minimum-jerk step from 0 at fraction 0 to 1 at fraction 1, flat at both ends.
+    """Compute a minimum-jerk step from 0 at fraction 0 to 1 at fraction 1, flat at both ends.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ class MotionBounds:
     def of(
         cls, kinematics: Any, demonstrated: tuple[Tensor, Tensor] | None = None, **given: Any
     ) -> Self:
-        """Bounds of a robot, of what was demonstrated, and of the user.
+        """Choose the bounds of a robot, of what was demonstrated, and of the user.
 
         Accelerations and jerks that neither the user nor the description of the robot gives
         are three times those demonstrated, and let every joint reach its speed limit in
@@ -151,7 +151,7 @@ def _warn_of_missing_limits(
 def _complete_rates(
     bound: Mapping[str, Tensor], demonstrated: tuple[Tensor, Tensor] | None
 ) -> dict[str, Tensor]:
-    """Acceleration and jerk, also where they are infinite: of no robot and no user."""
+    """Complete acceleration and jerk where they are infinite: of no robot and no user."""
     velocity, acceleration, jerk = (bound[n] for n in ("velocity", "acceleration", "jerk"))
     seconds, shown = RISE_TIME_ALONE, [torch.zeros_like(velocity)] * 2
     if demonstrated is not None:
@@ -174,7 +174,7 @@ def _complete_rates(
 
 
 def _tighten_bound(name: str, kinematics: Kinematics, given: Any) -> Tensor:
-    """The robot's own bound and the user's."""
+    """Tighten the robot's own bound by the user's."""
     own, joints = getattr(kinematics, name), kinematics.joint_names
     if own is None:
         own = torch.full_like(kinematics.lower, torch.inf)

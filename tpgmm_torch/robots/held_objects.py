@@ -22,7 +22,7 @@ def held_objects(
     *,
     attached: bool = False,
 ) -> tuple[RobotState, dict[str, Frame]]:
-    """Objects that were held as links of the state, and as the places where they were free.
+    """Add objects that were held as links, and find the places where they were free.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def held_objects(
 
 
 def _carry_object(state: RobotState, pose: Frame, link: str, begin: int, end: int) -> Frame:
-    """Poses (T,) of what a link carries between two instants, and leaves where it is then."""
+    """Compute poses (T,) of what a link carries between two instants, then leaves."""
     hand = state.pose(link)
     grasp = pose[begin].seen_from(hand[begin])
     instants = torch.arange(len(hand.position), device=hand.position.device)

@@ -31,7 +31,7 @@ class JointSpace(Described):
         self.lower, self.upper, self.velocity = -unbounded, unbounded, unbounded
 
     def state(self, joints: Any) -> RobotState:
-        """The state with no link in it; see :meth:`Kinematics.state`."""
+        """Return the state with no link in it; see :meth:`Kinematics.state`."""
         joints = self.joint_tensor(joints)
         shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
         p, o, jacobians = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
@@ -39,7 +39,7 @@ class JointSpace(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """The inverse of ``config``."""
+        """Invert ``config``."""
         return cls(config["joint_names"])
 
     def __repr__(self) -> str:

@@ -104,7 +104,7 @@ def reduce(
 
 
 def _locked_position(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
-    """Where a joint stands that is not in the joint vector."""
+    """Return the position of a joint that is not in the joint vector."""
     if leader.joint not in locked:
         raise DataError(
             f"joint {leader.joint!r} moves link {link!r}: it is measured in radians (or "
@@ -114,7 +114,7 @@ def _locked_position(leader: Mimic, locked: Mapping[str, float], link: str) -> f
 
 
 def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:
-    """The last step from the base to each other link: the joint, and the link before it."""
+    """Find the last step from the base to each link: a joint, and the link before it."""
     above = {joint.child: joint for joint in model.joints}
     steps = {child: (joint, joint.parent) for child, joint in above.items()}
     steps.pop(base, None)
@@ -127,7 +127,7 @@ def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]
 
 
 def _joint_transform(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
-    """From the near link of a joint to the far one: a pose, the axis of a motion, a pose."""
+    """Cross a joint from its near link to the far one: a pose, the axis, a pose."""
     if FREEDOMS[joint.type] > 1:
         raise DataError(
             f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
@@ -141,7 +141,7 @@ def _joint_transform(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
 
 
 def _z_to(axis: Array) -> Array:
-    """A rotation that takes the z axis to a unit vector, as a homogeneous matrix."""
+    """Rotate the z axis to a unit vector: a homogeneous matrix."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     matrix = np.eye(4)

@@ -28,7 +28,7 @@ __all__ = ["Described", "Kinematics", "RobotState", "parse_dtype"]
 
 
 def parse_dtype(dtype: Any) -> torch.dtype:
-    """The ``dtype`` of a robot, also given by its name, ``"float32"`` or ``"float64"``.
+    """Parse the ``dtype`` of a robot, also a name, ``"float32"`` or ``"float64"``.
 
     Raises
     ------
@@ -87,41 +87,41 @@ class RobotState:
         return self.links[: len(self.links) - len(self.carriers)]
 
     def position(self, link: str) -> Tensor:
-        """``x_{t-1}`` of a link [m], shape (..., 3)."""
+        """Return ``x_{t-1}`` of a link [m], shape (..., 3)."""
         return self.positions[..., self._index(link), :]
 
     def orientation(self, link: str) -> Tensor:
-        """``eps_{t-1}`` of a link, unit quaternion of shape (..., 4)."""
+        """Return ``eps_{t-1}`` of a link, unit quaternion of shape (..., 4)."""
         return self.orientations[..., self._index(link), :]
 
     def pose(self, link: str) -> Frame:
-        """Position and orientation of a link."""
+        """Return position and orientation of a link."""
         return Frame.from_checked(self.position(link), self.orientation(link))
 
     def jacobian(self, link: str) -> Tensor:
-        """``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""
+        """Return ``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""
         return self.jacobians[..., self._index(link), :, :]
 
     def linear_jacobian(self, link: str) -> Tensor:
-        """``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
+        """Return ``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
         return self.jacobian(link)[..., :3, :]
 
     def angular_jacobian(self, link: str) -> Tensor:
-        """``J_o`` of a link: angular velocity per joint velocity, shape (..., 3, n_joints)."""
+        """Return ``J_o`` of a link: angular velocity per joint velocity, (..., 3, n_joints)."""
         return self.jacobian(link)[..., 3:, :]
 
     def quaternion_columns(self, link: str) -> slice | None:
-        """Where the quaternion of a link is in the joint vector: nowhere, on a robot."""
+        """Locate a link's quaternion in the joint vector: nowhere, on a robot."""
         return None
 
     def carrier(self, link: str) -> int | Tensor:
-        """The index of the robot's link that a link is, or that carries it; -1 if none does."""
+        """Return the index of the robot's link that a link is, or that carries it; else -1."""
         index = self._index(link)
         n_robot = len(self.links) - len(self.carriers)
         return index if index < n_robot else self.carriers[index - n_robot]
 
     def displace_link(self, link: str, step: Tensor) -> Self:
-        """The state with a link taken to be elsewhere, with the same orientation and Jacobian.
+        """Move a link elsewhere, with the same orientation and Jacobian.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class RobotState:
     def with_link(
         self, name: str, link: str | None, pose: Frame, where: Tensor | None = None
     ) -> Self:
-        """The state with an object as a link of its own, which a link of the robot carries.
+        """Add an object as a link of its own, which a link of the robot carries.
 
         With ``r = R_l p`` from the origin of the link to the object, this is at ``x_l + r``
         and moves with ``J_p + J_o x r``, ``J_o``.
@@ -215,7 +215,7 @@ class RobotState:
         )
 
     def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
-        """The state with each of its tensors changed, given the rank behind the batch."""
+        """Change each of the tensors, given the rank behind the batch."""
         return replace(
             self,
             joints=change(self.joints, 1),
@@ -229,7 +229,7 @@ class RobotState:
         )
 
     def flatten(self, batch: torch.Size) -> Self:
-        """The states of a whole batch, its dimensions as one."""
+        """Flatten the dimensions of a whole batch into one."""
         last = len(batch) - 1
 
         def whole(part: Tensor, rank: int) -> Tensor:
@@ -316,7 +316,7 @@ class Kinematics(abc.ABC):
         return len(self.joint_names)
 
     def gripping(self) -> Tensor | None:
-        """Joints that close around things: named as grippers, and no link moves with them.
+        """Find joints that close around things: named as grippers, and moving no link.
 
         One that holds something does not come to its reference: where it stands says nothing
         of whether the robot follows.
@@ -383,7 +383,7 @@ class Kinematics(abc.ABC):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """The same kinematics in another dtype or on another device; itself if none changes."""
+        """Convert to another dtype or device; itself if none changes."""
         other = copy.copy(self)
         for name in {*vars(self), "lower", "upper", "velocity"}:
             value = getattr(self, name)
@@ -402,7 +402,7 @@ class Described(Kinematics):
     _config: dict[str, Any]
 
     def config(self) -> dict[str, Any]:
-        """Arguments of ``from_config``, ready for JSON."""
+        """Return arguments of ``from_config``, ready for JSON."""
         return copy.deepcopy(self._config)
 
     @classmethod

@@ -41,7 +41,7 @@ HOW_TO_INSTALL = "pip install 'tpgmm-torch[simulation]'"
 
 
 def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
-    """The text of a URDF that moves as an MJCF does.
+    """Write a URDF that moves as an MJCF does.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
 
 
 def mujoco_module(purpose: str) -> Any:
-    """MuJoCo, or a DependencyError that says what it is needed for and how to install it."""
+    """Import MuJoCo, or raise an error that says what needs it and how to install it."""
     try:
         import mujoco
     except ImportError as error:
@@ -80,7 +80,7 @@ def mujoco_module(purpose: str) -> Any:
 
 
 def compile_mjcf(mjcf: str | os.PathLike[str], what: str) -> Any:
-    """The compiled model of an MJCF, a path or the text itself, that errors call ``what``."""
+    """Compile an MJCF, a path or the text itself, that errors call ``what``."""
     mujoco = mujoco_module(f"compiling {what}")
     try:
         if is_text(mjcf):
@@ -154,7 +154,7 @@ class _Translation:
         return UrdfJoint(name, motion_of, near, far, start, axis, lower, upper, velocity)
 
     def _limits(self, joint: int) -> tuple[float, float, float]:
-        """Lower, upper and velocity: of the joint, and of the servos that drive it.
+        """Compute lower, upper and velocity: of the joint, and of the servos that drive it.
 
         The force of a servo is ``gain * control + bias . (1, l, l')`` with the length ``l``,
         ``gear * q``: it is in balance where that is zero.
@@ -198,7 +198,7 @@ class _Translation:
         return low, high, velocity
 
     def _mimics(self) -> dict[int, Mimic]:
-        """Joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by active equalities."""
+        """Find joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by equalities."""
         model = self.model
         mimics: dict[int, Mimic] = {}
         is_joint = model.eq_type == self.mujoco.mjtEq.mjEQ_JOINT
@@ -212,7 +212,7 @@ class _Translation:
         return mimics
 
     def _visuals(self) -> dict[str, list[ElementTree.Element]]:
-        """Visual geometry of links: the solids of URDF, without ellipsoids and planes."""
+        """Convert visual geometry of links: the solids of URDF."""
         visuals: dict[str, list[ElementTree.Element]] = {link: [] for link in self.links}
         shown_groups = self.mujoco.MjvOption().geomgroup  # MuJoCo's own; others collide
         for geom in map(self.model.geom, range(self.model.ngeom)):
@@ -255,7 +255,7 @@ class _Translation:
 
 
 def _names(element: Any, count: int, kind: str) -> list[str]:
-    """The names of all bodies or joints; those without one are called by their number."""
+    """Return the names of all bodies or joints, or their numbers."""
     given = [element(index).name for index in range(count)]
     return [name or free_name(f"{kind}{i}", given) for i, name in enumerate(given)]
 

@@ -203,7 +203,7 @@ class Robot(Described):
     def from_file(
         cls, description: str | os.PathLike[str], links: Sequence[str], **settings: Any
     ) -> Self:
-        """The robot of a URDF or an MJCF, whichever the outermost element says it is.
+        """Read a URDF or an MJCF, whichever the outermost element says it is.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class Robot(Described):
         base: str = "world",
         **robots: Robot,
     ) -> Self:
-        """Several robots side by side as one: two arms on a table are one bimanual robot.
+        """Combine robots side by side: two arms on a table are one bimanual robot.
 
         Parameters
         ----------
@@ -341,7 +341,7 @@ class Robot(Described):
         return self
 
     def state(self, joints: Any) -> RobotState:
-        """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
+        """Compute poses and Jacobians of all links at ``joints`` (..., n_joints).
 
         Raises
         ------
@@ -364,7 +364,7 @@ class Robot(Described):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """The robot of another dtype or on another device; itself if nothing changes."""
+        """Convert to another dtype or device; itself if nothing changes."""
         name = str(dtype or self.lower.dtype).removeprefix("torch.")
         device = self.lower.device if device is None else torch.device(device)
         if name == self._config["dtype"] and device == self.lower.device:
@@ -373,7 +373,7 @@ class Robot(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
-        """The robot that gave this ``config``."""
+        """Make the robot that gave this ``config``."""
         places = "urdf", "links", "base", "tools"
         cls._check_keys(config, *places, "joints", "locked", "coordinates", "dtype")
         if not isinstance(config["urdf"], str) or not config["urdf"].startswith("<"):
@@ -382,7 +382,7 @@ class Robot(Described):
         return cls.from_urdf(**{**config, "dtype": dtype, "device": device})
 
     def drop_limits(self, names: Collection[str]) -> Self:
-        """The robot with some joints as coordinates: without limits, in any unit ("raw").
+        """Make coordinates of some joints: without limits, in any unit ("raw").
 
         Parameters
         ----------
@@ -419,7 +419,7 @@ class Robot(Described):
             ElementTree.ElementTree(urdf).write(file, "utf-8", xml_declaration=True)
 
     def _root(self) -> Frame:
-        """Where the root of the description is in the frame of the base, which it must hold."""
+        """Locate the root of the description in the frame of the base, which it must hold."""
         config = self._config | {"links": [self.model.root], "dtype": "float64"}
         state = type(self)(self.model, config, "cpu").state(torch.zeros(self.n_joints))
         if state.jacobians.any():
@@ -452,7 +452,7 @@ def _joint_vector(
     coordinates: tuple[str, ...],
     locked: Mapping[str, float],
 ) -> tuple[list[str], dict[str, float]]:
-    """Names of the joint vector, and where all other actuated joints stand."""
+    """Choose the names of the joint vector, and where all other actuated joints stand."""
     columns = [*_match_names(model, _names("joints", joints or ()), coordinates)]
     fixed = _locked_positions(model, locked, columns)
     if joints is None:
@@ -507,7 +507,7 @@ def _match_name(model: UrdfModel, name: str, coordinates: Sequence[str]) -> list
 
 
 def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
-    """A tool as plain numbers: parent link, position, quaternion."""
+    """Describe a tool by plain numbers: parent link, position, quaternion."""
     if isinstance(tool, str) or not 2 <= len(tool) <= 3:
         raise DataError(
             f"tool {name!r} is (parent link, Frame) or (parent link, position, quaternion), "
@@ -526,7 +526,7 @@ def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
 
 
 def _pose(name: str, given: Any) -> Frame:
-    """A pose as it is given to ``combine``."""
+    """Read a pose as it is given to ``combine``."""
     if isinstance(given, Frame):
         return given.to(torch.float64)
     values = as_tensor(given, f"the pose of {name!r}").to(torch.float64)
@@ -551,7 +551,7 @@ def _check_bases(places: Mapping[str, Frame]) -> None:
 def _select_links(
     model: UrdfModel, config: Mapping[str, Any]
 ) -> tuple[str, list[tuple[str, Array]]]:
-    """The base, and for each wanted link a link of the URDF and the pose in it."""
+    """Select the base, and for each link one of the URDF and the pose in it."""
     here = np.eye(4)
     places = {link: (link, here) for link in model.links}
     if config["base"] not in places:
@@ -571,7 +571,7 @@ def _select_links(
 def _merge_urdfs(
     robots: Mapping[str, Robot], roots: Mapping[str, Frame], fixed: Iterable[str]
 ) -> str:
-    """The URDF of robots and fixed links, whose roots are somewhere in a world."""
+    """Merge robots and fixed links, whose roots are somewhere in a world."""
     urdf = ElementTree.Element("robot", name=" and ".join(robots))
     urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))
     for name, robot in robots.items():
@@ -588,7 +588,7 @@ def _mount(urdf: ElementTree.Element, parent: str, link: str, pose: Frame) -> No
 
 
 def _prefix_names(prefix: str, robot: Robot) -> list[ElementTree.Element]:
-    """Links, joints and materials of a robot, with a prefix before all their names."""
+    """Put a prefix before all names of links, joints and materials of a robot."""
     urdf = parse_xml(robot.model.text)
     parts = [part for part in urdf if part.tag in ("link", "joint", "material")]
     for element in itertools.chain.from_iterable(part.iter() for part in parts):
@@ -599,7 +599,7 @@ def _prefix_names(prefix: str, robot: Robot) -> list[ElementTree.Element]:
 
 
 def _side_by_side(robots: Mapping[str, Robot]) -> dict[str, Any]:
-    """Settings of robots by name, which stands before the names of what is theirs."""
+    """Join the settings of robots by name, which stands before their names."""
     settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
     settings |= {"locked": {}, "tools": {}}
     for prefix, robot in robots.items():
@@ -613,7 +613,7 @@ def _side_by_side(robots: Mapping[str, Robot]) -> dict[str, Any]:
 
 
 def _matrix(pose: Frame) -> Array:
-    """A constant pose as a homogeneous matrix."""
+    """Convert a constant pose to a homogeneous matrix."""
     if pose.batch_shape != ():
         raise ShapeError(f"expected one constant pose, got {tuple(pose.batch_shape)} of them")
     matrix = np.eye(4)
@@ -625,7 +625,7 @@ def _matrix(pose: Frame) -> Array:
 def _limits(
     model: UrdfModel, names: Sequence[str], moving: Collection[str]
 ) -> tuple[Tensor, tuple[str, ...]]:
-    """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
+    """Tabulate lower, upper, velocity, acceleration, jerk; list joints that lack a limit.
 
     Joints that mimic another limit it too. Coordinates without kinematics have no limits, and
     lack none.

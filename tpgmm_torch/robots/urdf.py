@@ -161,7 +161,7 @@ class UrdfModel:
         return tuple(name for name, joint in self.movable.items() if joint.mimic is None)
 
     def leader(self, name: str) -> Mimic:
-        """The actuated joint on which a movable joint depends, and how.
+        """Find the actuated joint on which a movable joint depends, and how.
 
         Parameters
         ----------
@@ -177,12 +177,12 @@ class UrdfModel:
 
 
 def is_text(source: str | bytes | os.PathLike[str]) -> bool:
-    """Whether a description, ``source``, is given as text, and not as the path of a file."""
+    """Check whether a description, ``source``, is text, and not the path of a file."""
     return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
 
 
 def description_text(source: str | bytes | os.PathLike[str]) -> str:
-    """The text of a robot's description, in UTF-8 or else Latin-1.
+    """Read the text of a robot's description, in UTF-8 or else Latin-1.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """The outermost element of a description; prefixes, namespaces and comments mean nothing.
+    """Parse a description; prefixes, namespaces and comments mean nothing.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def _find_macros(root: ElementTree.Element) -> list[str]:
 
 
 def _lost_mimicry(joints: Iterable[UrdfJoint]) -> list[str]:
-    """Names of joints that mimic none that moves, or in the end themselves."""
+    """Find joints that mimic none that moves, or in the end themselves."""
     mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
     lost = []
     for name, leader in mimicry.items():
@@ -301,7 +301,7 @@ def _names(root: ElementTree.Element, tag: str) -> tuple[str, ...]:
 
 
 def _root_link(links: Sequence[str], joints: Sequence[UrdfJoint]) -> str:
-    """The one link from which all others hang."""
+    """Find the one link from which all others hang."""
     known, above, below = set(links), set[str](), defaultdict[str, list[str]](list)
     for joint in joints:
         for link in {joint.parent, joint.child} - known:
@@ -344,7 +344,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
 
 
 def _limits(element: ElementTree.Element) -> dict[str, Any]:
-    """Range and rates; values that cannot be, as tools write -1 or 0, are no limits.
+    """Read range and rates; values that cannot be, as tools write -1 or 0, are no limits.
 
     Without a range ``<limit>`` gives effort and velocity alone.
     """
@@ -372,7 +372,7 @@ def _rates(given: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _number(text: str | float) -> float:
-    """Number in an attribute, NaN where it is no number."""
+    """Read a number in an attribute, NaN where it is none."""
     try:
         return float(text)
     except ValueError:
@@ -393,7 +393,7 @@ def _mimic(element: ElementTree.Element) -> Mimic | None:
 def _numbers(
     element: ElementTree.Element, tag: str, attribute: str, *default: float
 ) -> list[float]:
-    """The finite numbers of an attribute of a joint's child, as many as ``default``."""
+    """Read the finite numbers of an attribute of a joint's child, as many as ``default``."""
     child = element.find(tag)
     text = None if child is None else child.get(attribute)
     if text is None:
@@ -414,7 +414,7 @@ def _numbers(
 
 
 def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
-    """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis.
+    """Compute the matrix of an origin: rotations about the fixed x, then y, then z axis.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
 
 
 def motion(kind: str, axis: Array, value: float) -> Array:
-    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation).
+    """Compute the matrix of a joint's motion (Rodrigues' formula, or a translation).
 
     Parameters
     ----------
@@ -455,7 +455,7 @@ def write_urdf(
     joints: Iterable[UrdfJoint],
     visuals: Mapping[str, Sequence[ElementTree.Element]] | None = None,
 ) -> str:
-    """The text of a description, its numbers to the last digit of float64.
+    """Write a description, its numbers to the last digit of float64.
 
     Parameters
     ----------
@@ -476,7 +476,7 @@ def write_urdf(
 
 
 def joint_element(joint: UrdfJoint) -> ElementTree.Element:
-    """The ``<joint>`` of a joint."""
+    """Write the ``<joint>`` of a joint."""
     element = ElementTree.Element("joint", name=joint.name, type=joint.type)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=joint.child)
@@ -495,18 +495,18 @@ def joint_element(joint: UrdfJoint) -> ElementTree.Element:
 
 
 def origin(pose: Array) -> ElementTree.Element:
-    """The ``<origin>`` of a homogeneous matrix ``pose``."""
+    """Write the ``<origin>`` of a homogeneous matrix ``pose``."""
     rpy = roll_pitch_yaw(pose[:3, :3])
     return ElementTree.Element("origin", xyz=numbers(pose[:3, 3]), rpy=numbers(rpy))
 
 
 def numbers(values: Iterable[float]) -> str:
-    """The ``values`` of an attribute, to the last digit."""
+    """Write the ``values`` of an attribute, to the last digit."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """The angles of which :func:`placement` makes a rotation again.
+    """Compute the angles of which :func:`placement` makes a rotation again.
 
     With the yaw undone a rotation is ``R_y(pitch) R_x(roll)``, whatever the yaw: where the
     pitch is a right angle and leaves it open, any will do, and no digits are lost nearby.
@@ -522,7 +522,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:
-    """``name``, with as many underscores behind it as make it one that is not ``taken``."""
+    """Append underscores to ``name`` until it is not ``taken``."""
     while name in taken:
         name += "_"
     return name

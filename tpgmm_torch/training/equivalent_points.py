@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 def equivalent_rows(
     rows: Rows, reference: Array, widths: Sequence[int], processes: Processes = ALONE
 ) -> tuple[Array, int]:
-    """Rows that stand for the demonstrations of all processes, and how many per instant.
+    """Replace the demonstrations of all processes by rows, some per instant.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def equivalent_rows(
 
 
 def equivalent_points(mean: Tensor, scatter: Tensor, size: int) -> Tensor:
-    """Points with given mean and mean squared deviation.
+    """Make points of given mean and mean squared deviation.
 
     Parameters
     ----------

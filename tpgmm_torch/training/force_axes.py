@@ -27,7 +27,7 @@ ALWAYS = (
 def with_force_axes(
     operators: Sequence[Operator], motions: Sequence[Motion]
 ) -> tuple[Operator, ...]:
-    """Operators of forces with the axes along which the demonstrated forces do no work.
+    """Add axes to operators of forces: those along which they do no work.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _choose_axes(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
 
 
 def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:
-    """Share of work ``|sum_t f v| / (n rms(f) rms(|v|))`` of a force along each axis.
+    """Compute ``|sum_t f v| / (n rms(f) rms(|v|))`` of a force along each axis.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ def find_holds(
 def attach_holds(
     demonstrations: Sequence[Demonstration], robot: Kinematics | None, **settings: Any
 ) -> list[Demonstration]:
-    """Demonstrations with what the robot holds in them, :func:`find_holds`, as their ``holds``.
+    """Attach what the robot holds, :func:`find_holds`, to demonstrations.
 
     Call it on demonstrations that are aligned in time, as the next to last step before ``fit``.
 
@@ -142,7 +142,7 @@ def attach_holds(
 def with_holds(
     demonstrations: Sequence[Demonstration], holds: Sequence[Hold]
 ) -> list[Demonstration]:
-    """Demonstrations in which the robot holds what is given.
+    """Attach given holds to demonstrations.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def with_holds(
 def holding_as_in(
     demonstration: Demonstration, joints: Tensor, kinematics: Kinematics
 ) -> Demonstration:
-    """A demonstration with what the robot holds in it where its joints are others.
+    """Attach what is held where the joints are others.
 
     Commanded joints are ahead of what they carry: what is held is found in measured ones.
 
@@ -176,7 +176,7 @@ def demonstrated_holds(
     operators: Sequence[Operator],
     kinematics: Kinematics,
 ) -> tuple[Hold, ...]:
-    """Holds of the objects that operators refer to, as the demonstrations' own ``holds`` agree.
+    """Agree on holds of the objects that operators refer to.
 
     Where the first says nothing and objects move with a link, there is a warning.
 
@@ -232,7 +232,7 @@ class _Motion:
         return self.demonstration.time.to(self.kinematics.lower)
 
     def holds(self, name: str) -> list[Hold]:
-        """The holds of an object, in the order of time."""
+        """Find the holds of an object, in the order of time."""
         if self.demonstration.holds is not None:
             return [hold for hold in self.demonstration.holds if hold.frame == name]
         pose, change = self.demonstration.frames[name], self.change
@@ -253,13 +253,13 @@ class _Motion:
         return _in_order([hold for *_, hold in sorted(found, key=lambda span: span[:2])])
 
     def _window(self) -> tuple[Tensor, Tensor]:
-        """For each instant, those between which its motion is measured."""
+        """Find, for each instant, those between which its motion is measured."""
         later = torch.searchsorted(self.time, self.time + SMOOTHING / 2)
         later = later.clamp(max=len(self.time) - 1)
         return torch.searchsorted(self.time, self.time - SMOOTHING / 2), later
 
     def _span(self, name: str, pose: Frame, seed: int) -> tuple[int, int, Hold] | None:
-        """Around a moment in motion: who held the object, if anyone did, and for how long."""
+        """Find who held the object around a moment in motion, if anyone, and for how long."""
         carried, change = list[tuple[str, int, int, Tensor]](), self.change
         for link, hand in self.links.items():
             grasp = pose.seen_from(hand)
@@ -289,7 +289,7 @@ class _Motion:
     def _find_touch(
         self, link: str, pose: Frame, first: int, lifted: int, finest: float
     ) -> int:
-        """The instant since which a link stands as it does before it lifts an object."""
+        """Find the instant since which a link stands as it does before it lifts an object."""
         hand, change = self.links[link], self.change
         sooner, later = self._window()
         close, _ = _run(change(hand[lifted : lifted + 1], hand) <= TRAVEL, lifted)
@@ -304,7 +304,7 @@ class _Motion:
 
 
 def _in_order(found: Sequence[Hold]) -> list[Hold]:
-    """Holds of an object, one at a time."""
+    """Put holds of an object in order, one at a time."""
     holds: list[Hold] = []
     for hold in found:
         before = holds[-1] if holds else None
@@ -318,7 +318,7 @@ def _in_order(found: Sequence[Hold]) -> list[Hold]:
 
 
 def _run(true: Tensor, seed: int) -> tuple[int, int]:
-    """First and last index of the stretch around ``seed`` in which all are true."""
+    """Find first and last index of the stretch around ``seed`` in which all are true."""
     false = torch.nonzero(~true)[:, 0]
     before, after = false[false < seed], false[false > seed]
     first = int(before[-1]) + 1 if len(before) else 0
@@ -326,7 +326,7 @@ def _run(true: Tensor, seed: int) -> tuple[int, int]:
 
 
 def _most_common_holds(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
-    """Of the holds of one object in each demonstration, what most of them show."""
+    """Find the holds of an object that most demonstrations show."""
     orders = [tuple(hold.link for hold in holds) for holds in shown]
     [(order, count)] = Counter(filter(None, orders)).most_common(1) or [((), 0)]
     if count < max(agreement * len(shown), 1):

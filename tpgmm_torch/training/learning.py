@@ -151,7 +151,7 @@ def from_parameters(
     holds: Sequence[Hold] = (),
     **others: Any,
 ) -> Learned:
-    """A mixture of given parameters, which are kept as they are.
+    """Make a mixture of given parameters, which are kept as they are.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def from_parameters(
 def _of_mixture(
     settings: Mapping[str, Any], operators: Sequence[Operator], kinematics: Kinematics
 ) -> dict[str, Any]:
-    """Parameters of the mixture of the local data of all operators."""
+    """Collect parameters of the mixture of the local data of all operators."""
     return {name: settings[name] for name in SHARED} | {
         "blocks": block_widths(operators, kinematics)
     }

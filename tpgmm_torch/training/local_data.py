@@ -52,7 +52,7 @@ class Motion:
         *,
         attached: bool = False,
     ) -> Self:
-        """The motion of a ``demonstration`` in which ``holds`` says what the robot holds.
+        """Compute the motion of a ``demonstration`` in which the robot holds ``holds``.
 
         Where that is ``attached``, the joints move it; else its Jacobians are zero.
 
@@ -79,7 +79,7 @@ class Motion:
         return cls(time, state, frames)
 
     def coordinates(self, operator: Operator, kinematics: Kinematics) -> Tensor:
-        """Local coordinates (T, D_j), quaternions continuous in sign."""
+        """Compute local coordinates (T, D_j), quaternions continuous in sign."""
         return operator.along(self.time, self.state, self.frames, kinematics)
 
 
@@ -90,7 +90,7 @@ def local_data(
     expected: Expected | None = None,
     holds: Sequence[Hold] = (),
 ) -> list[Tensor]:
-    """Rows of time and local coordinates of each demonstration.
+    """Compute rows of time and local coordinates of each demonstration.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def match_rows(
 
 
 def like(templates: Sequence[Tensor]) -> Expected:
-    """Coordinates of one motion, at equal phase, as what is expected.
+    """Expect the coordinates of one motion, at equal phase.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def like(templates: Sequence[Tensor]) -> Expected:
 
 
 def at_phases(rows: Tensor, count: int) -> Tensor:
-    """Some rows of one motion, at equal distances from first to last.
+    """Select rows of one motion, at equal distances from first to last.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def at_phases(rows: Tensor, count: int) -> Tensor:
 def constant_columns(
     smallest: Tensor, largest: Tensor, operators: Sequence[Operator], kinematics: Kinematics
 ) -> Tensor:
-    """Columns that vary by rounding alone, to be made constant.
+    """Find columns that vary by rounding alone, to be made constant.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ __all__ = ["with_mean_orientations"]
 def with_mean_orientations(
     operators: Sequence[Operator], motions: Sequence[Motion], kinematics: Kinematics
 ) -> tuple[Operator, ...]:
-    """Operators of ``geometry="tangent"`` with the mean of the demonstrated orientations.
+    """Add mean orientations to operators of ``geometry="tangent"``.
 
     At each instant it is the mean on the sphere of what the demonstrations show then.
 

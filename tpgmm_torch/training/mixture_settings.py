@@ -27,7 +27,7 @@ COMPARED = (Canonical, Wrench, *POSE_OPERATORS)
 
 
 def check_operators(operators: Any) -> tuple[Operator, ...]:
-    """The operators; ``(Canonical(),)`` where none are given.
+    """Check the operators; ``(Canonical(),)`` where none are given.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def kinematics_for(
     dtype: str,
     device: str,
 ) -> Kinematics:
-    """Kinematics that the operators act on, checked to have what they need.
+    """Choose the kinematics that the operators act on, and check what they need.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def kinematics_for(
 
 
 def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
-    """1 + D_j of each of the operators on the kinematics: time, and its local coordinates."""
+    """Compute 1 + D_j of each operator: time, and its local coordinates."""
     return tuple(1 + operator.dimension(kinematics) for operator in operators)
 
 
@@ -114,7 +114,7 @@ def regularization(
     reg_covar: float,
     covariance_type: str,
 ) -> NDArray[np.float64]:
-    """``reg_covar`` and the operators' tolerances, as shares of each column's variance.
+    """Express ``reg_covar`` and tolerances as shares of each column's variance.
 
     For coordinates that are deviations from a path, ``reg_covar`` is relative to the variance
     of both: it is the same whether a base moves or stands.

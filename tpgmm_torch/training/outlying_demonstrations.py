@@ -75,7 +75,7 @@ def outlying_demonstrations(
     threshold: float = 8.0,
     duration: float = 0.5,
 ) -> tuple[Outlying, ...]:
-    """Demonstrations far from the median of all, at instants at which the others agree.
+    """Find demonstrations far from the median, at instants at which others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
     more than ``threshold`` times 1.4826 times the median distance from the median. Where the
@@ -111,7 +111,7 @@ def outlying_demonstrations(
 def outlying_rows(
     rows: TrainingRows, kinematics: Kinematics, *, threshold: float = 8.0, duration: float = 0.5
 ) -> tuple[Outlying, ...]:
-    """:func:`outlying_demonstrations` of rows that are read, of all batches and processes.
+    """Find outlying demonstrations in rows that are read.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def outlying_rows(
 def comparable_coordinates(
     data: Tensor, operators: Sequence[Operator], kinematics: Kinematics, least: float = 0.0
 ) -> Iterator[tuple[Operator, Tensor, float]]:
-    """Coordinates of demonstrations that have one unit, by operator, and what is near in it.
+    """Yield coordinates that have one unit, by operator, and what is near in it.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def drop_outliers(
     threshold: float = 8.0,
     duration: float = 0.5,
 ) -> list[Demonstration]:
-    """Demonstrations without those unlike the others, of which a warning tells.
+    """Drop demonstrations unlike the others, with a warning.
 
     Of five or more, up to a third are left out.
 
@@ -240,7 +240,7 @@ def drop_outliers(
 
 
 def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:
-    """A finding that names demonstrations unlike the others, the worst first.
+    """Describe demonstrations unlike the others, the worst first.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class TrainingRows:
     edges: NDArray[np.intp]
 
     def at_phases(self, count: int) -> Tensor:
-        """Rows of all demonstrations of all processes at equal phase.
+        """Select rows of all demonstrations of all processes at equal phase.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class TrainingRows:
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
-        """Those rows, in memory, whose time is from ``begin`` to before ``end`` [s].
+        """Select the rows, in memory, whose time is from ``begin`` to before ``end`` [s].
 
         Raises
         ------
@@ -107,7 +107,7 @@ class TrainingRows:
 
 
 def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
-    """Demonstrations in batches, checked as they come; a list of them is one batch.
+    """Check demonstrations batch by batch; a list of them is one batch.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
 
 
 def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
-    """The batches of X, without empty ones; X itself if it holds demonstrations."""
+    """Yield the batches of X, without empty ones; X itself if it holds demonstrations."""
     if not isinstance(X, Iterable):
         check_demonstrations(X)  # says what is wrong
     walk = iter(X)
@@ -225,7 +225,7 @@ def read_rows(
 
 
 def _store_rows(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
-    """Rows of all demonstrations, in a file unless in one batch, and where each begins."""
+    """Store rows, in a file unless of one batch, and where each demonstration begins."""
     kept: Any = [] if alone else RowFile()
     lengths = [0]
     for rows in each:
@@ -241,7 +241,7 @@ def _remove_rounding(
     kinematics: Kinematics,
     processes: Processes,
 ) -> NDArray[Any]:
-    """Rows of the first demonstration of all; what varies by rounding alone is as in it."""
+    """Make constant what varies by rounding alone; return the first demonstration."""
     moments = ColumnMoments.of(stored, processes)
     first = processes.gather(stored[:length])[0]
     low, high = (
@@ -255,7 +255,7 @@ def _remove_rounding(
 def _group_instants(
     rows: TrainingRows, first: NDArray[Any], responsibilities: str, widths: Sequence[int]
 ) -> TrainingRows:
-    """Rows of one instant together where the demonstrations have one time grid.
+    """Group rows of one instant where the demonstrations have one time grid.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def _group_instants(
 def _typical_time(
     stored: Rows, edges: NDArray[np.intp], processes: Processes
 ) -> tuple[Tensor, int]:
-    """Time grid of the demonstration of median duration of all processes, and their number."""
+    """Find the time grid of median duration, and count the demonstrations of all."""
     spans = [(float(stored[i, 0]), float(stored[j - 1, 0])) for i, j in pairwise(edges)]
     own = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
     everyone = list(chain.from_iterable(processes.gather(own)))
@@ -295,7 +295,7 @@ def _typical_time(
 
 
 def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
-    """Which demonstration has the median duration.
+    """Find the demonstration that has the median duration.
 
     Parameters
     ----------
