@@ -31,13 +31,9 @@ from sklearn.base import BaseEstimator
 from tpgmm_torch.exceptions import DataError, InvalidParameterError, NotFittedError
 
 __all__ = [
-    "ANYTHING",
-    "DemonstrationEstimator",
-    "Interval",
-    "Options",
-    "check_parameters",
+    "ANYTHING", "DemonstrationEstimator", "Interval", "Options", "check_parameters",
     "check_positive",
-]
+]  # fmt: skip
 
 #: Entry of a parameter that is checked elsewhere.
 ANYTHING: tuple[Any, ...] = (object,)

@@ -24,16 +24,9 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = [
-    "Instants",
-    "PoseErrors",
-    "PoseScorer",
-    "joint_rmse",
-    "largest_acceleration",
-    "largest_speeds",
-    "largest_velocity",
-    "pose_errors",
-    "reproduction_scorer",
-]
+    "Instants", "PoseErrors", "PoseScorer", "joint_rmse", "largest_acceleration",
+    "largest_speeds", "largest_velocity", "pose_errors", "reproduction_scorer",
+]  # fmt: skip
 
 
 #: An event's name, or an instant or several [s].

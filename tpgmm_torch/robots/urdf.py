@@ -25,22 +25,10 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
 __all__ = [
-    "Mimic",
-    "UrdfJoint",
-    "UrdfModel",
-    "description_text",
-    "free_name",
-    "is_text",
-    "joint_element",
-    "motion",
-    "numbers",
-    "origin",
-    "parse_xml",
-    "placement",
-    "read_urdf",
-    "roll_pitch_yaw",
-    "write_urdf",
-]
+    "Mimic", "UrdfJoint", "UrdfModel", "description_text", "free_name", "is_text",
+    "joint_element", "motion", "numbers", "origin", "parse_xml", "placement", "read_urdf",
+    "roll_pitch_yaw", "write_urdf",
+]  # fmt: skip
 
 #: Limits of a joint, in the order in which they are tabulated.
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
@@ -108,13 +96,13 @@ class UrdfJoint:
 
     @property
     def lacks_limits(self) -> bool:
-        """Whether a limit of position or speed that it should have is not known."""
+        """Lacks a limit of position or speed that it should have."""
         endless = self.type != "continuous" and math.isinf(self.upper)
         return endless or math.isinf(self.velocity)
 
     @property
     def movable(self) -> bool:
-        """Whether it has one degree of freedom."""
+        """Has one degree of freedom."""
         return FREEDOMS[self.type] == 1
 
 

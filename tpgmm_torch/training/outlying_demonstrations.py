@@ -28,13 +28,9 @@ from tpgmm_torch.training.mixture_settings import check_operators, kinematics_fo
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 __all__ = [
-    "Outlying",
-    "comparable_coordinates",
-    "drop_outliers",
-    "outlying_demonstrations",
-    "outlying_rows",
-    "unlike_the_others",
-]
+    "Outlying", "comparable_coordinates", "drop_outliers", "outlying_demonstrations",
+    "outlying_rows", "unlike_the_others",
+]  # fmt: skip
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
