@@ -140,6 +140,7 @@ def check_positive(settings: Any, *may_vanish: str) -> None:
     Parameters
     ----------
     settings : dataclass
+        With numbers as fields.
     *may_vanish : str
         Fields that may also be 0.
 

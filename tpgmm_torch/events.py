@@ -114,6 +114,7 @@ def find_gripper_changes(demonstration: Demonstration) -> list[Boundary]:
     Parameters
     ----------
     demonstration : Demonstration
+        Of at least two time steps.
     """
     time, values = as_array(demonstration.time), as_array(demonstration.joints)
     names = demonstration.joint_names or ()
@@ -134,6 +135,7 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
     Parameters
     ----------
     demonstration : Demonstration
+        Of at least two time steps.
     robot : Kinematics, optional
         Whose links take them.
     """
@@ -309,6 +311,7 @@ def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]
     Parameters
     ----------
     time : array of shape (T,)
+        Ascending instants [s].
     values : array of shape (T, n)
         Which count as one: their first principal component.
 
@@ -405,6 +408,7 @@ def high_stretches(values: Array, on: float, off: float) -> list[tuple[int, int]
     Parameters
     ----------
     values : array of shape (T,)
+        A signal.
     on, off : float
         The larger and the smaller threshold; between them nothing changes.
 

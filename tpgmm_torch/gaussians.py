@@ -38,6 +38,7 @@ def block_diagonal(matrices: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
     Parameters
     ----------
     matrices : sequence of Tensor of shape (..., m, n)
+        From the upper left on.
     batch : sequence of int
         Shape of the batch, with which theirs broadcast.
     """
@@ -282,6 +283,7 @@ def log_density(
     residuals : Tensor of shape (..., D, r)
         Deviations, as columns.
     covariance : Tensor of shape (..., D, D)
+        Positive definite.
     name : str
         How the error message calls the covariance.
     degrees : float, optional

@@ -172,6 +172,7 @@ def match_hemisphere(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,))
     Parameters
     ----------
     x, reference : Tensor of shape (..., D)
+        Coordinates, and those to which sides are compared.
     starts : sequence of int, default=(0,)
         Where quaternions begin among the coordinates; others stay as they are.
     """
@@ -313,6 +314,7 @@ def interpolate(time: Tensor, knots: Tensor, q: Tensor) -> Tensor:
     Parameters
     ----------
     time : Tensor of shape (...)
+        When orientations are wanted.
     knots : Tensor of shape (T,)
         Ascending times.
     q : Tensor of shape (T, 4)

@@ -44,6 +44,7 @@ def check_situations(
     times : Tensor
         When references are wanted [s].
     kinematics : Kinematics
+        Whose limits count.
     learned : Tensor of shape (T,)
         The model's time grid [s].
     summaries : sequence of TrainingSummary, optional

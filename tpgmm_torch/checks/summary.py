@@ -173,7 +173,9 @@ class TrainingSummary:
     Parameters
     ----------
     n_demonstrations : int
+        How many were learned from, at least 1.
     joint_names : tuple of str
+        In the order of the model.
     start_low, start_high : sequence of float
         Range of the start postures [rad or m].
     compared : sequence of int
@@ -184,6 +186,7 @@ class TrainingSummary:
         The largest distance of a demonstration from the others, within 0.5 and 2: the unit of
         novelty.
     frames : mapping of str to FrameSummary
+        Poses by the names of the frames.
     events : mapping of str to float
         Median times of events that all demonstrations have, as shares of the duration.
     postures : sequence of sequence of float
@@ -236,6 +239,7 @@ class TrainingSummary:
         episodes : sequence of EpisodeSummary
             With their joints in the order of the kinematics.
         kinematics : Kinematics
+            Of the model.
         """
         starts = np.stack([episode.start for episode in episodes])
         state = kinematics.state(starts)
@@ -295,6 +299,7 @@ class TrainingSummary:
         joints : array-like of shape (..., n_joints)
             Start postures.
         kinematics : Kinematics
+            Of the model.
         given : collection of str
             Frames that are known.
 

@@ -93,6 +93,7 @@ class EpisodeSummary:
     begin, duration, step : float
         When it begins, its length, and its median step of time [s].
     joint_names : tuple of str or None
+        As of the demonstration.
     start, low, high : array of shape (n_joints,)
         Start posture, and range of each joint.
     frames : mapping of str to PathSummary
@@ -206,6 +207,7 @@ def check(
     episodes : sequence of EpisodeSummary
         As :func:`summarize` gives them.
     kinematics : Kinematics
+        Whose limits and links count.
     operators : sequence of Operator
         What is learned.
     holds : sequence of Hold
@@ -312,7 +314,9 @@ def ranges(
     columns : sequence of int
         Which joints to list.
     low, high : array of shape (n_joints,)
+        Range of each joint.
     limits : array of shape (2, n_joints)
+        Lower and upper of each joint; infinite where there are none.
     """
     places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
     bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]

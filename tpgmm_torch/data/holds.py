@@ -125,6 +125,7 @@ def check_holds(
     Parameters
     ----------
     holds : iterable of Hold
+        What links hold, in any order.
     frames : collection of str
         The objects that there are.
     links : collection of str

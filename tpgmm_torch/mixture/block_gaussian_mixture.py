@@ -93,11 +93,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     Attributes
     ----------
     weights_ : Tensor of shape (K,)
+        Shares of the components; they add up to 1.
     means_ : list of Tensor of shape (K, D_j)
         One per block.
     covariances_ : list of Tensor of shape (K, D_j, D_j)
         One per block, full matrices whatever the ``covariance_type``.
     converged_ : bool
+        Whether the best start came to its end before ``max_iter``.
     n_iter_ : int
         Iterations of the best start.
     lower_bound_ : float
@@ -107,6 +109,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Its history, which never falls. Where reseeding a component lowers it, the history
         begins again at that point.
     n_features_in_ : int
+        Number of columns of all blocks.
 
     Warns
     -----
@@ -352,6 +355,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Points, one in each row.
 
         Returns
         -------
@@ -369,6 +373,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Points, one in each row.
 
         Returns
         -------
@@ -403,6 +408,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Parameters
         ----------
         n_samples : int, default=1
+            Number of points.
 
         Returns
         -------

@@ -40,6 +40,7 @@ def shrinkage_intensity(
     covariance : Tensor of shape (..., D, D)
         Positive definite.
     intensity : float or "auto"
+        The share itself, or "auto" to estimate it.
     n_samples : float or Tensor of shape (...)
         How many independent samples a covariance was learned from.
     """
@@ -74,6 +75,7 @@ def shrink(
     Parameters
     ----------
     covariances : Tensor of shape (K, D, D)
+        Positive definite, one for each component.
     intensity : float or "auto"
         The share l, from 0 to 1, as in :func:`shrinkage_intensity`.
     n_samples : float or Tensor of shape (K,)

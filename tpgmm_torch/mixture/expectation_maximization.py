@@ -50,6 +50,7 @@ class Parameters:
     Parameters
     ----------
     weights : Tensor of shape (K,)
+        Positive; they add up to 1.
     means : tuple of Tensor of shape (K, D_j)
         One per block.
     covariances : tuple of Tensor of shape (K, D_j, D_j)
@@ -78,6 +79,7 @@ class CovarianceFamily:
     Parameters
     ----------
     covariance_type : {"full", "tied", "diag", "spherical"}
+        As of the estimator.
     diagonals : tuple of Tensor of shape (D_j,)
         Per block the diagonal of the regularisation ``Lambda``.
     """
@@ -233,6 +235,7 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     parameters : Parameters
         In the units of the points.
     points : Points
+        What the mixture is learned from.
     least : Tensor of shape (n_chunks,), optional
         That of the last pass; without it all components are evaluated at all points.
     """
@@ -271,9 +274,11 @@ def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expe
     Parameters
     ----------
     points : Points
+        What the mixture is learned from.
     labeller : callable
         Gives the components of points.
     n_components : int
+        Number of components K.
     """
     like = points.shift
     zeros = [like.new_zeros(n_components, width) for width in points.widths]
@@ -340,7 +345,9 @@ def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -
     Parameters
     ----------
     expectation : Expectation
+        Sums of a pass over the points.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     floor : bool
         False adds ``Lambda`` to every covariance, as scikit-learn does: close to the most
         likely mixture, but not exactly it, so that the likelihood can fall by a little.
@@ -384,6 +391,7 @@ def dead_components(
     family : CovarianceFamily
         With the regularisation.
     points : Points
+        What the mixture is learned from.
     """
     mass = expectation.mass
     vanished = mass < 10 * torch.finfo(points.dtype).eps * points.total
@@ -410,9 +418,11 @@ def restart_components(
     proposal : Parameters
         What the M step gave.
     dead : Tensor of bool, of shape (K,)
+        Components to be moved.
     explaining : Parameters
         The mixture of the E step, whose densities count.
     points : Points
+        What the mixture is learned from.
     rng : RandomState
         In the same state in all processes.
     """
@@ -452,11 +462,14 @@ class Fit:
     Attributes
     ----------
     parameters : Parameters
+        The mixture after the last M step.
     bounds : list of float
         Mean log-likelihood of the mixture before each M step, never falling: where reseeding
         a component lowers it, the list begins again.
     n_iter : int
+        Number of M steps.
     converged : bool
+        Whether the bound rose by less than the tolerance.
     reseedings : list of str
         Which components were reseeded when, as text.
     """
@@ -489,10 +502,13 @@ def expectation_maximization(
     start : Parameters
         A mixture of the family.
     points : Points
+        What the mixture is learned from.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     rng : RandomState
         Chooses where dead components start again; in the same state in all processes.
     tol : float
+        Rise of the bound at which EM ends [nats].
     max_iter : int
         Most M steps, at least 1.
     """

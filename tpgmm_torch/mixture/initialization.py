@@ -38,8 +38,11 @@ def draw_starts(
         Equal bins along time, bins of random sizes from the second start on; clusters of
         scikit-learn's k-means (one run); the nearest of some distinct points drawn at random.
     n_starts, n_components : int
+        Number of starts, and of components of each.
     points : Points
+        What the mixture is learned from.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     rng : RandomState
         In the same state in all processes.
 

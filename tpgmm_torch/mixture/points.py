@@ -40,6 +40,7 @@ class Points:
     n_components : int
         Of the mixture, which decides how large a chunk is.
     dtype : torch.dtype
+        Of the standardised rows.
     group_size : int
         So many consecutive rows stay together.
     processes : Processes

@@ -109,6 +109,7 @@ def pieces(rows: Rows) -> Iterator[NDArray[np.float64]]:
     Parameters
     ----------
     rows : array of shape (n, n_features), or RowFile
+        In memory, or in a file.
     """
     for start in range(0, len(rows), FILE_ROWS):
         yield np.asarray(rows[start : start + FILE_ROWS], dtype=np.float64)
@@ -125,6 +126,7 @@ class ColumnMoments:
     mean, scatter : array of shape (n_features,)
         Mean, and sum of squared deviations from it.
     smallest, largest : array of shape (n_features,)
+        Range of each column.
     """
 
     count: int

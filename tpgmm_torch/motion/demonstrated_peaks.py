@@ -32,6 +32,7 @@ def demonstrated_peaks(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of the joints named.
     joint_names : sequence of str
         The joints, in their order.
 

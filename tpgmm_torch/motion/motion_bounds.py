@@ -93,6 +93,7 @@ class MotionBounds:
         Parameters
         ----------
         kinematics : Kinematics or Skill
+            Whose limits hold, or a skill, whose peaks count too.
         demonstrated : tuple of two Tensor of shape (n_joints,), optional
             Peaks of acceleration and jerk, of
             :func:`~tpgmm_torch.motion.demonstrated_peaks.demonstrated_peaks`.

@@ -107,6 +107,7 @@ class TreeKinematics:
         Parameters
         ----------
         joints : Tensor of shape (B, n_joints)
+            Joint vectors [rad or m].
 
         Returns
         -------

@@ -126,6 +126,7 @@ class RobotState:
         Parameters
         ----------
         link : str
+            Name of the link that is moved.
         step : Tensor of shape (..., 3)
             From where it is, in the base frame [m].
         """

@@ -203,6 +203,7 @@ def parse_xml(text: str) -> ElementTree.Element:
     Parameters
     ----------
     text : str
+        Of a URDF or an MJCF.
 
     Raises
     ------
@@ -502,6 +503,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     Parameters
     ----------
     rotation : ndarray of shape (3, 3)
+        Orthogonal, of determinant 1.
     """
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     back = motion("revolute", np.eye(3)[2], -yaw)[:3, :3] @ rotation

@@ -37,6 +37,7 @@ def equivalent_rows(
     widths : sequence of int
         D_j of each block.
     processes : Processes
+        Among which the rows are spread.
 
     Returns
     -------
@@ -70,6 +71,7 @@ def equivalent_points(mean: Tensor, scatter: Tensor, size: int) -> Tensor:
     Parameters
     ----------
     mean : Tensor of shape (T, D)
+        Of the points of each instant.
     scatter : Tensor of shape (T, D, D)
         Positive semi-definite.
     size : int

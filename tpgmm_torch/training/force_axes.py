@@ -34,6 +34,7 @@ def with_force_axes(
     operators : sequence of Operator
         Those that have axes keep them.
     motions : sequence of Motion
+        With wrenches of the operators' links.
 
     Returns
     -------

@@ -121,6 +121,7 @@ def attach_holds(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     robot : Kinematics or None
         Without one nothing is held.
     **settings
@@ -147,6 +148,7 @@ def with_holds(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     holds : sequence of Hold
         Empty if it holds nothing.
     """
@@ -163,9 +165,11 @@ def holding_as_in(
     Parameters
     ----------
     demonstration : Demonstration
+        With poses of objects over time.
     joints : Tensor of shape (T, n_joints)
         In the order of the demonstration's.
     kinematics : Kinematics
+        Whose links may hold.
     """
     seen = replace(demonstration, joints=joints)
     return replace(demonstration, holds=find_holds([seen], kinematics))
@@ -183,8 +187,11 @@ def demonstrated_holds(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     operators : sequence of Operator
+        Which refer to objects.
     kinematics : Kinematics
+        Whose links may hold.
 
     Returns
     -------

@@ -53,11 +53,13 @@ class Learned:
     operators : tuple of Operator
         With the mean orientations of the demonstrations.
     kinematics : Kinematics
+        In the precision and on the device of the model.
     time : Tensor of shape (T,)
         Time grid of a typical demonstration [s].
     holds : tuple of Hold
         In the time of the skill.
     n_demonstrations : int or None
+        How many were learned from; None if that is not known.
     peaks : tuple of two Tensor of shape (n_joints,), or None
         Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
     summary : TrainingSummary or None

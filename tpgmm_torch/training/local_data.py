@@ -33,6 +33,7 @@ class Motion:
     Parameters
     ----------
     time : Tensor of shape (T,)
+        Instants [s].
     state : RobotState
         Of batch shape (T,), with the objects that it holds.
     frames : mapping of str to Frame
@@ -95,8 +96,11 @@ def local_data(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     expected : callable, optional
         Quaternions come to the side of what it says; by default to that of the first
         demonstration, and columns that vary by rounding alone become constant.
@@ -182,7 +186,9 @@ def at_phases(rows: Tensor, count: int) -> Tensor:
     Parameters
     ----------
     rows : Tensor of shape (T, ...)
+        Of one motion, in the order of time.
     count : int
+        Number of rows to select.
 
     Returns
     -------
@@ -201,7 +207,9 @@ def constant_columns(
     smallest, largest : Tensor of shape (sum_j (1 + D_j),)
         Of each column.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
 
     Returns
     -------

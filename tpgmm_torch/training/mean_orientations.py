@@ -29,6 +29,7 @@ def with_mean_orientations(
     motions : sequence of Motion
         In step.
     kinematics : Kinematics
+        On which the operators act.
 
     Returns
     -------

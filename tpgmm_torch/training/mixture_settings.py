@@ -73,6 +73,7 @@ def kinematics_for(
     demonstrations : sequence of Demonstration
         At least one; they name the joints where there is no robot.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     robot : Kinematics, optional
         Without it the joints alone, a :class:`~tpgmm_torch.robots.joint_space.JointSpace`.
     dtype, device : str
@@ -124,7 +125,9 @@ def regularization(
     moments : ColumnMoments
         Of the rows that a mixture is learned from.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     reg_covar, covariance_type
         Parameters of :class:`~tpgmm_torch.TaskParameterizedGMM`.
 

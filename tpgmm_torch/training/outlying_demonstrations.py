@@ -85,7 +85,9 @@ def outlying_demonstrations(
         none that are unlike the others, and where it would be more than a third of them, they
         show several ways rather than mistakes.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     threshold : float, default=8.0
         So many robust standard deviations from the median are unlike the others. On real
         recordings those who are not reach 6.1, those whose frame was taken at a wrong instant,
@@ -112,7 +114,9 @@ def outlying_rows(
     Parameters
     ----------
     rows : TrainingRows
+        Of all demonstrations.
     kinematics : Kinematics
+        On which the operators act.
     threshold, duration : float
         As there.
     """
@@ -152,6 +156,7 @@ def comparable_coordinates(
     operators : sequence of Operator
         Members of a :class:`Stack` come one by one.
     kinematics : Kinematics
+        On which the operators act.
     least : float, default=0
         Joints are compared in units of their ranges, of at least that [rad or m].
 

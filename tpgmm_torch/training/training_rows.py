@@ -188,9 +188,13 @@ def read_rows(
     batches : iterable of sequence of Demonstration
         Of this process, at least one.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     responsibilities : {"auto", "instant", "point"}
+        Whether one is for all points of an instant, as of the estimator.
     processes : Processes
+        Among which the rows are spread.
 
     Raises
     ------
