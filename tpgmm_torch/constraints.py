@@ -73,21 +73,22 @@ class Interval:
         if not isinstance(value, self.kind) or isinstance(value, BOOLEANS):
             return False
         number = float(value)  # type: ignore[arg-type]
-        left = self.low is not None and self.closed in ("left", "both")
-        right = self.high is not None and self.closed in ("right", "both")
-        low = -np.inf if self.low is None else self.low
-        high = np.inf if self.high is None else self.high
-        above = number >= low if left else number > low
-        below = number <= high if right else number < high
+        low, high, left, right = self._ends()
+        above = number >= low if left == "[" else number > low
+        below = number <= high if right == "]" else number < high
         return above and below  # NaN is neither
 
     def __str__(self) -> str:
+        low, high, left, right = self._ends()
+        kind = "an int" if self.kind is Integral else "a float"
+        return f"{kind} in the range {left}{low:g}, {high:g}{right}"
+
+    def _ends(self) -> tuple[float, float, str, str]:
+        """Return the bounds, and the brackets that say which are themselves among them."""
         left = "[" if self.closed in ("left", "both") and self.low is not None else "("
         right = "]" if self.closed in ("right", "both") and self.high is not None else ")"
-        low = "-inf" if self.low is None else f"{self.low:g}"
-        high = "inf" if self.high is None else f"{self.high:g}"
-        kind = "an int" if self.kind is Integral else "a float"
-        return f"{kind} in the range {left}{low}, {high}{right}"
+        low = -np.inf if self.low is None else self.low
+        return low, np.inf if self.high is None else self.high, left, right
 
 
 @dataclass(frozen=True)

@@ -226,10 +226,7 @@ class Demonstration:
         UnknownNameError
             If one of the names is not among the demonstration's.
         """
-        columns = _columns(joint_names, self.joint_names, "the demonstration")
-        if columns is None:
-            return self
-        return replace(self, joints=self.joints[:, columns], joint_names=tuple(joint_names))
+        return _reorder(self, joint_names, "the demonstration")
 
     def __repr__(self) -> str:
         return (
@@ -325,10 +322,7 @@ class Situation:
         UnknownNameError
             If one of the names is not among the situation's.
         """
-        columns = _columns(joint_names, self.joint_names, "the situation")
-        if columns is None:
-            return self
-        return replace(self, joints=self.joints[columns], joint_names=tuple(joint_names))
+        return _reorder(self, joint_names, "the situation")
 
     def __repr__(self) -> str:
         time = "" if self.time is None else f", {len(self.time)} steps"
@@ -362,16 +356,18 @@ def _values(joints: Mapping[str, Any]) -> Tensor:
     return torch.cat(parts) if parts else torch.empty(0)
 
 
-def _columns(
-    wanted: Sequence[str], present: tuple[str, ...] | None, where: str
-) -> list[int] | None:
-    """Find wanted joints among those present; None if as they are, or unnamed."""
+def _reorder[Given: (Demonstration, Situation)](
+    given: Given, wanted: Sequence[str], where: str
+) -> Given:
+    """Select wanted joints, in their order; all as they are where they are unnamed."""
+    present = given.joint_names
     if present is None or present == tuple(wanted):
-        return None
+        return given
     for name in wanted:
         if name not in present:
             raise UnknownNameError("joint", name, where, present)
-    return [present.index(name) for name in wanted]
+    columns = [present.index(name) for name in wanted]
+    return replace(given, joints=given.joints[..., columns], joint_names=tuple(wanted))
 
 
 def check_robot(robot: Any) -> None:

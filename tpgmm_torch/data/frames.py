@@ -83,8 +83,7 @@ class Frame:
         # what is of unit norm but for rounding stays as it is, bit for bit
         rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps
         norm = norm - torch.where(rounded, excess, 0.0)
-        object.__setattr__(self, "position", position)
-        object.__setattr__(self, "orientation", orientation / norm)
+        vars(self).update(position=position, orientation=orientation / norm)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -212,6 +211,5 @@ class Frame:
             Unit quaternions (w, x, y, z).
         """
         frame = cls.__new__(cls)
-        object.__setattr__(frame, "position", position)
-        object.__setattr__(frame, "orientation", orientation)
+        vars(frame).update(position=position, orientation=orientation)
         return frame
