@@ -31,7 +31,7 @@ from tpgmm_torch.training.mixture_settings import (
     regularization,
 )
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
-from tpgmm_torch.training.training_rows import TrainingRows, batches_of, read_rows
+from tpgmm_torch.training.training_rows import TrainingRows, batches_of, check_alike, read_rows
 
 __all__ = ["Learned", "from_parameters", "learn"]
 
@@ -102,8 +102,9 @@ def learn(
         If demonstrations do not fit together, or with the robot and the operators, or cannot
         be what they are taken for.
     """
-    operators, batches = check_operators(settings["operators"]), batches_of(X, processes)
-    head = next(batches)
+    operators, batches = check_operators(settings["operators"]), batches_of(X)
+    head = next(batches, [])
+    check_alike(head, processes)
     where = settings["dtype"], settings["device"]
     kinematics = kinematics_for(head, operators, settings["robot"], *where)
     if settings["fusion"] is not None:

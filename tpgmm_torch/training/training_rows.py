@@ -32,7 +32,7 @@ from tpgmm_torch.training.local_data import (
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import block_widths
 
-__all__ = ["TrainingRows", "batches_of", "read_rows", "typical"]
+__all__ = ["TrainingRows", "batches_of", "check_alike", "read_rows", "typical"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +106,13 @@ class TrainingRows:
         )
 
 
-def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
+def batches_of(X: Any) -> Iterator[list[Demonstration]]:
     """Check demonstrations batch by batch; a list of them is one batch.
 
     Parameters
     ----------
     X : iterable of Demonstration, or of sequence of Demonstration
         Batches are read once.
-    processes : Processes
-        All of which need demonstrations of the same joints and frames.
 
     Yields
     ------
@@ -123,8 +121,7 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
     Raises
     ------
     DataError, ShapeError
-        If there is none, or some differ from those before in joints or frames; the message
-        says in which batch.
+        If some differ from those before in joints or frames; the message says in which batch.
     """
     first: list[Demonstration] = []
     for number, batch in enumerate(_split(X)):
@@ -135,12 +132,8 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
                 raise
             kind = type(error) if isinstance(error, DataError) else DataError
             raise kind(f"batch {number} of demonstrations: {error}") from error
-        if not first:
-            first = checked[:1]
-            _check_alike(first[0], processes)
+        first = first or checked[:1]
         yield checked
-    if not first:
-        _check_alike(None, processes)
 
 
 def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
@@ -155,10 +148,23 @@ def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
         yield list(chain([first], walk))
 
 
-def _check_alike(first: Demonstration | None, processes: Processes) -> None:
-    """Refuse, in all processes, shares without demonstrations, or of other joints or frames."""
+def check_alike(batch: Sequence[Demonstration], processes: Processes) -> None:
+    """Refuse, in all processes, shares without demonstrations, or of other joints or frames.
+
+    Parameters
+    ----------
+    batch : sequence of Demonstration
+        The first of this process; empty if it has none.
+    processes : Processes
+        All of which need demonstrations of the same joints and frames.
+
+    Raises
+    ------
+    DataError
+        If they do not have them; the message says in which process.
+    """
     text = ""
-    if first is not None:
+    for first in batch[:1]:
         joints = list(first.joint_names or [f"{first.n_joints} without names"])
         text = f"joints {joints}, frames {sorted(first.frames)}"
     texts = processes.gather(text)
