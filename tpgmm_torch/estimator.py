@@ -404,7 +404,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
             Of the demonstrations.
         **settings
             Parameters of the constructor, ``robot`` among them:
-            :class:`~tpgmm_torch.robots.joint_space.JointSpace` where operators need no links.
+            :class:`~tpgmm_torch.robots.kinematics.JointSpace` where operators need no links.
 
         Returns
         -------

@@ -145,7 +145,7 @@ class MixtureParameters(nn.Module):
         ----------
         model : TaskParameterizedGMM
             With the settings, the operators and the robot that the parameters belong to; a
-            :class:`~tpgmm_torch.robots.joint_space.JointSpace` serves as robot where the
+            :class:`~tpgmm_torch.robots.kinematics.JointSpace` serves as robot where the
             operators need none.
 
         Raises

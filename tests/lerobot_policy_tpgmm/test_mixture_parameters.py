@@ -17,7 +17,7 @@ from tests.support.skills import (
 from tests.support.skills import new_handling as situation
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 DIMENSIONS = [operator.dimension(HANDS) for operator in HANDLING]
 

@@ -74,7 +74,7 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.training.hold_detection import with_holds
 from tpgmm_torch.training.local_data import local_data
 

@@ -54,7 +54,7 @@ class MotionBounds:
 
     Examples
     --------
-    >>> from tpgmm_torch.robots.joint_space import JointSpace
+    >>> from tpgmm_torch.robots.kinematics import JointSpace
     >>> bounds = MotionBounds.of(JointSpace(["a", "b"]), velocity=2.0, acceleration={"b": 8.0})
     >>> bounds.acceleration.tolist()
     [20.0, 8.0]

@@ -5,15 +5,14 @@ from typing import TYPE_CHECKING
 
 # readers of descriptions are loaded where a robot is made of one (PEP 562)
 if TYPE_CHECKING:
-    from tpgmm_torch.robots.joint_space import JointSpace
-    from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+    from tpgmm_torch.robots.kinematics import JointSpace, Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.tracked_poses import Poses
 
 __all__ = ["JointSpace", "Kinematics", "Poses", "Robot", "RobotState"]
 
 _HOME = {
-    "JointSpace": "joint_space",
+    "JointSpace": "kinematics",
     "Kinematics": "kinematics",
     "Poses": "tracked_poses",
     "Robot": "robot",

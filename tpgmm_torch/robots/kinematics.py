@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import copy
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -24,7 +24,7 @@ from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
-__all__ = ["Described", "Kinematics", "RobotState", "parse_dtype"]
+__all__ = ["Described", "JointSpace", "Kinematics", "RobotState", "parse_dtype"]
 
 
 def parse_dtype(dtype: Any) -> torch.dtype:
@@ -419,3 +419,37 @@ class Described(Kinematics):
 
     def __hash__(self) -> int:
         return hash((type(self), json.dumps(self._config, sort_keys=True)))
+
+
+class JointSpace(Described):
+    """Joints of those ``joint_names`` and nothing else: enough for :class:`Canonical` alone.
+
+    ``dtype`` and ``device`` are those of its states.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.joint_names = tuple(joint_names)
+        self._config = {"joint_names": list(self.joint_names)}
+        self.links = ()
+        unbounded = torch.full((len(self.joint_names),), torch.inf, dtype=dtype, device=device)
+        self.lower, self.upper, self.velocity = -unbounded, unbounded, unbounded
+
+    def state(self, joints: Any) -> RobotState:
+        """Return the state with no link in it; see :meth:`Kinematics.state`."""
+        joints = self.joint_tensor(joints)
+        shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
+        p, o, jacobians = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
+        return RobotState(joints, (), p, o, jacobians, (), self.joint_names)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Invert ``config``."""
+        return cls(config["joint_names"])
+
+    def __repr__(self) -> str:
+        return f"JointSpace({len(self.joint_names)} joints)"

@@ -17,8 +17,7 @@ from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Canonical, Operator, Wrench
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
-from tpgmm_torch.robots.joint_space import JointSpace
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.kinematics import JointSpace, Kinematics
 
 __all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
 
@@ -75,7 +74,7 @@ def kinematics_for(
     operators : sequence of Operator
         In whose local coordinates it is seen.
     robot : Kinematics, optional
-        Without it the joints alone, a :class:`~tpgmm_torch.robots.joint_space.JointSpace`.
+        Without it the joints alone, a :class:`~tpgmm_torch.robots.kinematics.JointSpace`.
     dtype, device : str
         In what precision and where it shall compute, as the estimator's parameters say.
 

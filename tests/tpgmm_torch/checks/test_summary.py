@@ -14,7 +14,7 @@ from tpgmm_torch.checks import Region, TrainingSummary
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 SKILL = generator()
 

@@ -23,7 +23,7 @@ from tpgmm_torch.checks import check
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 HAND = Poses(["hand"], orientation=False)
 PUT = RelativePosition("cup", "tray")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])

@@ -36,8 +36,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots import robot as robot_module
-from tpgmm_torch.robots.joint_space import JointSpace
-from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import JointSpace, RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.robots.urdf import read_urdf

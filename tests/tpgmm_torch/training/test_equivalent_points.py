@@ -6,8 +6,8 @@ import torch
 
 from tests.support.skills import HANDLING, HANDS, handlings
 from tpgmm_torch.mixture.row_file import RowFile
-from tpgmm_torch.training.equivalent_points import equivalent_points, equivalent_rows
 from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.training_rows import equivalent_points, equivalent_rows
 
 
 def test_a_few_points_have_the_moments_of_many():

@@ -9,8 +9,8 @@ import torch
 from tests.support.pressing import FRICTION, PRESS, slides, wipes
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Wrench
-from tpgmm_torch.training.force_axes import shares_of_work, with_force_axes
 from tpgmm_torch.training.local_data import Motion
+from tpgmm_torch.training.operator_completion import shares_of_work, with_force_axes
 
 HAND = Wrench("hand", "board")
 

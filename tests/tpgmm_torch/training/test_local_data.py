@@ -8,7 +8,7 @@ from tests.support.local_coordinates import local_coordinates
 from tests.support.motions import turning
 from tpgmm_torch import AbsoluteOrientation, AbsolutePosition, Canonical, Demonstration, Stack
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.training.local_data import constant_columns, like, local_data
 

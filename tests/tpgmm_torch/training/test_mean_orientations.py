@@ -32,7 +32,7 @@ from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.local_data import Motion
-from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.operator_completion import with_mean_orientations
 
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 3, 60, dtype=torch.float64)

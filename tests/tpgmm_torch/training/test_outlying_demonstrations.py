@@ -10,7 +10,7 @@ import torch
 from tests.support.skills import HANDLING, HANDS, handlings, hands_model, waves
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.exceptions import PlausibilityWarning
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers, outlying_demonstrations
 
 
