@@ -292,7 +292,7 @@ def largest_speeds(motion: Trajectory | Demonstration) -> Tensor:
 
 
 def largest_acceleration(motion: Trajectory | Demonstration) -> float:
-    """Compute the largest joint acceleration by second differences [rad/s^2].
+    """Compute the largest joint acceleration of a ``motion`` [rad/s^2], by second differences.
 
     Examples
     --------

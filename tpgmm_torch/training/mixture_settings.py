@@ -102,7 +102,7 @@ def kinematics_for(
 
 
 def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
-    """Compute 1 + D_j of each operator: time, and its local coordinates."""
+    """Compute 1 + D_j of each of the operators on the kinematics: time, and coordinates."""
     return tuple(1 + operator.dimension(kinematics) for operator in operators)
 
 
