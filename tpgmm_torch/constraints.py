@@ -28,11 +28,10 @@ import numpy as np
 from numpy.random import RandomState
 from sklearn.base import BaseEstimator
 
-from tpgmm_torch.exceptions import DataError, InvalidParameterError, NotFittedError
+from tpgmm_torch.exceptions import InvalidParameterError, NotFittedError
 
 __all__ = [
     "ANYTHING", "DemonstrationEstimator", "Interval", "Options", "check_parameters",
-    "check_positive",
 ]  # fmt: skip
 
 #: Entry of a parameter that is checked elsewhere.
@@ -132,28 +131,6 @@ def check_parameters(estimator: Any) -> None:
             raise InvalidParameterError(
                 f"the {name!r} parameter of {type(estimator).__name__} must be {allowed}, "
                 f"not {values[name]!r}"
-            )
-
-
-def check_positive(settings: Any, *may_vanish: str) -> None:
-    """Check that all fields of a dataclass are numbers above 0; infinity is one.
-
-    Parameters
-    ----------
-    settings : dataclass
-        With numbers as fields.
-    *may_vanish : str
-        Fields that may also be 0.
-
-    Raises
-    ------
-    DataError
-        If one of them is not.
-    """
-    for name, value in vars(settings).items():
-        if not (value > 0 or (value == 0 and name in may_vanish)):
-            raise DataError(
-                f"{name} of {type(settings).__name__} is a positive number, got {value!r}"
             )
 
 

@@ -81,7 +81,7 @@ def quaternion_blocks(
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
-    """Return the quaternion of no rotation, ``(1, 0, 0, 0)``, of that ``dtype`` and ``device``."""
+    """Return the quaternion of no rotation, of that ``dtype``, on that ``device``."""
     return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device)
 
 

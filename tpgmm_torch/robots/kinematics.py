@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
@@ -315,26 +314,6 @@ class Kinematics(abc.ABC):
     def n_joints(self) -> int:
         """Number of coordinates of the joint vector."""
         return len(self.joint_names)
-
-    def gripping(self) -> Tensor | None:
-        """Find joints that close around things: named as grippers, and moving no link.
-
-        One that holds something does not come to its reference: where it stands says nothing
-        of whether the robot follows.
-
-        Returns
-        -------
-        Tensor of bool, shape (n_joints,)
-            None if there is no such joint, or no other one.
-        """
-        named = torch.tensor([is_gripper(name) for name in self.joint_names])
-        if not named.any() or named.all():
-            return None
-        somewhere = torch.clamp(torch.zeros_like(self.lower), self.lower, self.upper)
-        moved = self.state(somewhere).jacobians.abs() > 0
-        free = ~moved.flatten(end_dim=-2).any(0) if self.links else torch.ones_like(named)
-        found = named.to(free.device) & free
-        return found if bool(found.any()) else None
 
     @abc.abstractmethod
     def state(self, joints: Any) -> RobotState:

@@ -19,8 +19,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tpgmm_control.sensing.states import check_positive
 from tpgmm_control.sensing.wrenches import Wrenches
-from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.robots.kinematics import RobotState

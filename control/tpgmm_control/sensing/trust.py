@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_control.sensing.states import replace_fields
-from tpgmm_torch.constraints import check_positive
+from tpgmm_control.sensing.states import check_positive, replace_fields
 
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
 

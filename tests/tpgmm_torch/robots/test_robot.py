@@ -30,13 +30,13 @@ from tests.support.robot_zoo import (
     upper_body,
     zoo,
 )
-from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
+from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots import robot as robot_module
-from tpgmm_torch.robots.kinematics import JointSpace, RobotState
+from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.robots.urdf import read_urdf
@@ -486,21 +486,3 @@ class TestErrors:
     def test_joints_that_are_not_finite(self, value: float) -> None:
         with pytest.raises(DataError, match="NaN or infinite"):
             zoo().state([0.0, value, 0.0, 0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("robot", "expected"),
-    [
-        (upper_body(), None),
-        (upper_body(coordinates=["l_grip", "r_grip", "lamp"]), ["l_grip", "r_grip"]),
-        (Robot.from_urdf(so101_urdf(), ["gripper_frame_link"], joints="*"), ["gripper"]),
-        (JointSpace(["elbow", "left_gripper"]), ["left_gripper"]),
-        (JointSpace(["left_gripper", "right_gripper"]), None),
-    ],
-)
-def test_joints_that_grip_are_named_so_and_move_no_link(robot, expected):
-    found = robot.gripping()
-    if expected is None:
-        assert found is None
-    else:
-        assert [robot.joint_names[i] for i in found.nonzero()] == expected
