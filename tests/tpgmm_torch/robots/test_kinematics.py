@@ -1,5 +1,6 @@
 """States of robots as tensors, and robots of a user's own."""
 
+import copy
 import math
 import re
 from typing import Any
@@ -15,7 +16,7 @@ from tests.support.robot_zoo import assert_differences_agree, random_joints, upp
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import RobotState
-from tpgmm_torch.robots.kinematics import parse_dtype
+from tpgmm_torch.robots.kinematics import JointSpace, parse_dtype
 
 #: A grasp.
 CUP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
@@ -239,3 +240,36 @@ def test_dtypes_go_by_name() -> None:
     for dtype in ("float16", torch.float16):
         with pytest.raises(DataError, match=r"one of \['float32', 'float64'\], got .*float16"):
             parse_dtype(dtype)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_a_state_has_joints_and_no_link(batch):
+    state = JointSpace(["a", "b"]).state(torch.ones(*batch, 2))
+    assert torch.equal(state.joints, torch.ones(*batch, 2, dtype=torch.float64))
+    assert state.links == ()
+    assert state.positions.shape == (*batch, 0, 3)
+    assert state.orientations.shape == (*batch, 0, 4)
+    assert state.jacobians.shape == (*batch, 0, 6, 2)
+
+
+def test_nothing_is_limited():
+    space = JointSpace(["a", "b"], torch.float32)
+    assert space.lower.tolist() == [-torch.inf] * 2
+    assert space.upper.tolist() == space.velocity.tolist() == [torch.inf] * 2
+    assert space.lower.dtype == space.upper.dtype == space.velocity.dtype == torch.float32
+    assert space.state([1.0, 2.0]).joints.dtype == torch.float32
+
+
+def test_its_names_are_all_of_it():
+    space = JointSpace(("a", "b"))
+    assert space.joint_names == ("a", "b")
+    assert JointSpace.from_config(space.config()) == space == copy.deepcopy(space)
+    assert hash(JointSpace.from_config(space.config())) == hash(space)
+    assert space != JointSpace(("b", "a"))
+    assert space != ("a", "b")
+    assert repr(space) == "JointSpace(2 joints)"
+
+
+def test_other_numbers_of_joints_are_refused():
+    with pytest.raises(ShapeError, match=r"\['a', 'b'\], got \(3,\)"):
+        JointSpace(("a", "b")).state(torch.zeros(3))

@@ -1,6 +1,7 @@
-"""Models whose orientations are deviations from the demonstrations' mean, on the sphere."""
+"""What operators take from demonstrations: mean orientations on the sphere, axes of forces."""
 
 import math
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from tests.support.local_coordinates import local_coordinates
+from tests.support.pressing import FRICTION, PRESS, slides, wipes
 from tests.support.skills import few_bottles
 from tests.support.worlds import OBJECT, moved, upper_body
 from tpgmm_torch import (
@@ -24,6 +26,7 @@ from tpgmm_torch import (
     save,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators import Wrench
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
@@ -32,7 +35,11 @@ from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.local_data import Motion
-from tpgmm_torch.training.operator_completion import with_mean_orientations
+from tpgmm_torch.training.operator_completion import (
+    shares_of_work,
+    with_force_axes,
+    with_mean_orientations,
+)
 
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 3, 60, dtype=torch.float64)
@@ -265,3 +272,35 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
     heights, downhill, _ = cost(torch.cat((joints[None, None], joints + steps, joints - steps)))
     slope = (heights[1:18] - heights[18:]).squeeze() / 2e-6
     assert float((slope + downhill[0].squeeze()).abs().max() / downhill[0].abs().max()) < 1e-6
+
+
+PALM = Wrench("hand", "board")
+
+
+def motions(demonstrations):
+    return [Motion.of(one, slides()) for one in demonstrations]
+
+
+def test_friction_works_and_a_press_does_not():
+    shares, sizes = shares_of_work(PALM, motions(wipes()))
+    np.testing.assert_allclose(sizes, [FRICTION * PRESS, 0, PRESS], atol=1e-9)
+    assert shares[0] > 0.95
+    assert shares[2] < 0.05
+    assert with_force_axes([PALM], motions(wipes())) == (Wrench("hand", "board", [2]),)
+
+
+def test_given_axes_are_kept():
+    given = Wrench("hand", "board", [0])
+    assert with_force_axes([given], motions(wipes())) == (given,)
+
+
+def test_pushing_a_damper_is_work():
+    shown = wipes()[0]
+    time = np.asarray(shown.time)
+    way = 0.05 * np.sin(np.pi * time / time[-1])
+    joints = torch.from_numpy(np.stack((0 * way, 0 * way, 0.3 - way), -1))
+    wrench = torch.zeros(len(time), 6).double()
+    wrench[:, 2] = torch.from_numpy(-200 * np.gradient(way, time))
+    pushed = replace(shown, joints=joints, wrenches={"hand": wrench})
+    with pytest.raises(DataError, match=r"no force of 'hand' .* z 1\.00 at"):
+        with_force_axes([PALM], motions([pushed]))
