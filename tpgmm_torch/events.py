@@ -300,8 +300,8 @@ def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
             side = "".join(sorted({"left", "right"} & {*words(name)}))
             groups.setdefault(side, []).append(i)
     return {
-        names[own[0]] if len(own) == 1 else f"{side} hand".strip(): own
-        for side, own in groups.items()
+        names[columns[0]] if len(columns) == 1 else f"{side} hand".strip(): columns
+        for side, columns in groups.items()
     }
 
 

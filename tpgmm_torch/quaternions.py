@@ -253,9 +253,9 @@ def left_jacobian(rotation_vector: Tensor) -> Tensor:
     0.811
     """
     eye, cross, square, angle, small = _cross_and_angle(rotation_vector)
-    one = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
-    two = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
-    return eye + one * cross + two * cross @ cross
+    first = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
+    second = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
+    return eye + first * cross + second * cross @ cross
 
 
 def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:

@@ -51,9 +51,9 @@ def retime(
         Quaternions are interpolated by slerp, everything else linearly; constant frames are
         the same. Holds stay with the motion; an event after the end of the path is left out.
     """
-    own, joints = as_array(demonstration.time), demonstration.joints
-    steps = np.arange(len(own))
-    at = np.interp(path, own, steps)
+    recorded, joints = as_array(demonstration.time), demonstration.joints
+    steps = np.arange(len(recorded))
+    at = np.interp(path, recorded, steps)
     place = torch.from_numpy(at)
     lower = place.floor().long().clamp(0, len(demonstration) - 2)
     fraction = place - lower
@@ -65,13 +65,13 @@ def retime(
     grid = as_array(time)
 
     def clock(instant: float) -> float:
-        return float(np.interp(np.interp(instant, own, steps), at, grid))
+        return float(np.interp(np.interp(instant, recorded, steps), at, grid))
 
     end_of_path = at[-1] + 1e-9
     events = {
         name: clock(instant)
         for name, instant in demonstration.events.items()
-        if np.interp(instant, own, steps) <= end_of_path
+        if np.interp(instant, recorded, steps) <= end_of_path
     }
     holds = demonstration.holds
     if holds is not None:  # those outside the path shrink to an instant, and are left out

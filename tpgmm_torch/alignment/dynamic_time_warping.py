@@ -225,11 +225,11 @@ class DynamicTimeWarping(Alignment):
             or np.abs(warp - linear).max() <= tolerance
         ):
             return ""
-        own, time = self._held_out(demonstration), as_array(demonstration.time)
+        features, time = self._held_out(demonstration), as_array(demonstration.time)
         before, after = (
             # over both clocks: a part squeezed into an instant counts with its duration
             np.average(
-                ((resample(own, time, w) - self._held_out_target) ** 2).sum(axis=1),
+                ((resample(features, time, w) - self._held_out_target) ** 2).sum(axis=1),
                 weights=1 + np.gradient(w) / np.gradient(w).mean(),
             )
             for w in (linear, warp)

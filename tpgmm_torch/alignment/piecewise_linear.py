@@ -200,7 +200,7 @@ class EventAlignment(LinearTimeNormalization):
         if self.events is None:
             return known
         found = {event: [n for n in known if fnmatchcase(n, event)] for event in self.events}
-        names = [name for event, own in found.items() for name in own or [event]]
+        names = [name for event, fits in found.items() for name in fits or [event]]
         return [name for name in dict.fromkeys(names) if name not in ("start", "end")]
 
     def _anchors(self, demonstration: Demonstration, which: str = "the demonstration") -> Array:

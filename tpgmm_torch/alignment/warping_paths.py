@@ -185,10 +185,10 @@ def barycenter(
     for _ in range(max_iter):
         total, counts, cost = np.zeros_like(start), np.zeros(len(start)), 0.0
         for sequence in sequences:
-            path, one = warping_path(average, sequence, penalty, max_slope)
+            path, path_cost = warping_path(average, sequence, penalty, max_slope)
             np.add.at(total, path[:, 0], sequence[path[:, 1]])
             counts += np.bincount(path[:, 0], minlength=len(start))
-            cost += one
+            cost += path_cost
         if cost >= last * (1 - tol):
             break
         average, last = total / counts[:, None], cost

@@ -87,9 +87,9 @@ class Report:
         if not self.findings:
             return f"{self.subject}: nothing implausible"
         items = "; ".join(f"({n}) {finding}" for n, finding in enumerate(self, start=1))
-        one = "one thing is" if len(self) == 1 else f"{len(self)} things are"
+        things = "one thing is" if len(self) == 1 else f"{len(self)} things are"
         worst = "impossible" if self.errors() else "implausible"
-        return f"{self.subject}: {one} {worst}: {items}"
+        return f"{self.subject}: {things} {worst}: {items}"
 
     def errors(self) -> tuple[Finding, ...]:
         """Return the findings that are impossible."""

@@ -263,13 +263,13 @@ def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Itera
     allowed = BEYOND * np.minimum(limits[1] - limits[0], 1.0)
     # of the joints of the robot (rows) in the columns that were given
     excess = np.maximum(limits[0][:, None] - low, high - limits[1][:, None])
-    own, names = excess.diagonal(), kinematics.joint_names
-    impossible, unnamed = own.max(initial=0) > IMPOSSIBLE, episodes[0].joint_names is None
+    overshoot, names = excess.diagonal(), kinematics.joint_names
+    impossible, unnamed = overshoot.max(initial=0) > IMPOSSIBLE, episodes[0].joint_names is None
     least = np.full_like(allowed, IMPOSSIBLE) if impossible else allowed
-    beyond = [int(j) for j in np.argsort(-own) if own[j] > least[j]]
+    beyond = [int(j) for j in np.argsort(-overshoot) if overshoot[j] > least[j]]
     if not beyond:
         return
-    about, value = tuple(names[j] for j in beyond), float(own[beyond[0]])
+    about, value = tuple(names[j] for j in beyond), float(overshoot[beyond[0]])
     places = ranges(names, beyond, low, high, limits)
     cost = (excess - allowed[:, None]).clip(min=0)
     rows, columns = linear_sum_assignment(cost)

@@ -207,8 +207,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         shares, count = tensors[0], len(widths)
         if bool((shares < 0).any()) or abs(float(shares.sum()) - 1) > 1e-3:
             raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
-        own = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
-        whiten(parameters := Parameters(shares / shares.sum(), *own))
+        moments = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
+        whiten(parameters := Parameters(shares / shares.sum(), *moments))
         return model._set(parameters)
 
     def fit(
@@ -290,8 +290,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     ) -> list[Parameters]:
         """Choose where EM begins, in standardised units."""
         if start is None:
-            own = self.init_params, self.n_init, self.n_components
-            return draw_starts(*own, points, family, rng)
+            settings = self.init_params, self.n_init, self.n_components
+            return draw_starts(*settings, points, family, rng)
         given = len(start.weights_), [*map(_width, start.means_)]
         if given != (self.n_components, points.widths):
             raise ShapeError(
@@ -436,8 +436,10 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             raise NotFittedError(
                 f"this {type(self).__name__} is not fitted yet; call fit before this method"
             )
-        own = (tuple(x.double() for x in each) for each in (self.means_, self.covariances_))
-        return Parameters(self.weights_.double(), *own)
+        doubled = (
+            tuple(x.double() for x in blocks) for blocks in (self.means_, self.covariances_)
+        )
+        return Parameters(self.weights_.double(), *doubled)
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
         """Apply a function to the log of weight times density, (K, n), of the rows."""
@@ -446,8 +448,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         # centred, so that offsets cost no digits
         center = torch.cat([parameters.weights @ mean for mean in parameters.means])
         exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
-        maps, peaks = [own.to(dtype) for own in exact], peaks.to(dtype)
-        widths, found = [own.shape[1] for own in maps], []
+        maps, peaks = [block_map.to(dtype) for block_map in exact], peaks.to(dtype)
+        widths, found = [block_map.shape[1] for block_map in maps], []
         for start in range(0, len(points), FILE_ROWS):
             rows = torch.from_numpy(np.array(points[start : start + FILE_ROWS])).to(center)
             blocks = [

@@ -89,13 +89,15 @@ def shrink(
     """
     before, mixed = covariances[:, :given, :given], covariances[:, given:, :given]
     explained = mixed @ torch.linalg.solve(before, mixed.mT)
-    own = covariances[:, given:, given:] - explained
-    if own.shape[-1] > 1:
-        share = shrinkage_intensity(own, intensity, n_samples)[:, None, None]
-        own = (1 - share) * own + share * torch.diag_embed(own.diagonal(dim1=1, dim2=2))
-    freedom = torch.as_tensor(n_samples).to(own).expand(len(own)) - 1.0
+    residual = covariances[:, given:, given:] - explained
+    if residual.shape[-1] > 1:
+        share = shrinkage_intensity(residual, intensity, n_samples)[:, None, None]
+        residual = (1 - share) * residual + share * torch.diag_embed(
+            residual.diagonal(dim1=1, dim2=2)
+        )
+    freedom = torch.as_tensor(n_samples).to(residual).expand(len(residual)) - 1.0
     several = freedom > 0
-    variances = own.diagonal(dim1=1, dim2=2)
+    variances = residual.diagonal(dim1=1, dim2=2)
     moderated = variances.clone()
     for unit in sorted({unit for unit in units[given:] if unit is not None}):
         alike = [column for column, other in enumerate(units[given:]) if other == unit]
@@ -104,7 +106,7 @@ def shrink(
             moderated[:, alike] = found.where(several[:, None], variances[:, alike])
     ratio = (moderated / variances).sqrt()
     shrunk = covariances.clone()
-    shrunk[:, given:, given:] = own * ratio[:, :, None] * ratio[:, None] + explained
+    shrunk[:, given:, given:] = residual * ratio[:, :, None] * ratio[:, None] + explained
     return shrunk
 
 

@@ -181,8 +181,8 @@ def log_joint(
     list of Tensor of shape (K, D_j, n)
     """
     joint, whitened = peaks[:, None], []
-    for x, own in zip(blocks, maps, strict=True):
-        y = (own.flatten(0, 1) @ x).view(*own.shape[:2], -1)
+    for x, block_map in zip(blocks, maps, strict=True):
+        y = (block_map.flatten(0, 1) @ x).view(*block_map.shape[:2], -1)
         joint = torch.sub(joint, y.square().sum(1), alpha=0.5)
         whitened.append(y)
     if group_size > 1:
@@ -246,15 +246,18 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     limits = torch.minimum(least, ceilings.amax(1)) - (NEGLIGIBLE + MARGIN)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
-    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    rounded, heights = (
+        [block_map.to(points.dtype) for block_map in maps],
+        peaks.to(points.dtype),
+    )
     found, lowest = _Sums.zero(maps, peaks), []
     for (chunk, _), index, limit, ceiling in zip(
         points, chosen, limits.tolist(), ceilings, strict=True
     ):
         blocks = points.blocks(chunk)
         while True:
-            own = [m[index] for m in rounded], heights[index]
-            joint, whitened = log_joint(blocks, *own, points.group_size)
+            near = [block_map[index] for block_map in rounded], heights[index]
+            joint, whitened = log_joint(blocks, *near, points.group_size)
             density = joint.logsumexp(0)
             lowest.append(float(density.min()))
             if not limit > lowest[-1] - NEGLIGIBLE:  # nor where it is NaN
@@ -286,7 +289,10 @@ def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expe
     shares = like.new_full((n_components,), 1 / n_components)
     unit = Parameters(shares, tuple(zeros), tuple(ones))
     maps, peaks = whiten(unit)
-    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    rounded, heights = (
+        [block_map.to(points.dtype) for block_map in maps],
+        peaks.to(points.dtype),
+    )
     found = _Sums.zero(maps, peaks)
     for chunk, numbers in points:
         labels = labeller(chunk[points.values].T, numbers)
@@ -308,7 +314,9 @@ class _Sums:
 
     @classmethod
     def zero(cls, maps: Sequence[Tensor], peaks: Tensor) -> _Sums:
-        moments = [own.new_zeros(own.shape[2], *own.shape[:2]) for own in maps]
+        moments = [
+            block_map.new_zeros(block_map.shape[2], *block_map.shape[:2]) for block_map in maps
+        ]
         return cls(torch.zeros_like(peaks), torch.zeros_like(peaks[0]), moments)
 
     def add(
@@ -316,17 +324,17 @@ class _Sums:
     ) -> None:
         """Add a chunk, given the responsibilities (K', n) of some components."""
         self.mass.index_add_(0, index, gamma.sum(1, dtype=self.mass.dtype))
-        for x, y, own in zip(blocks, whitened, self.moments, strict=True):
+        for x, y, moments in zip(blocks, whitened, self.moments, strict=True):
             y.mul_(gamma[:, None])
             part = (x @ y.flatten(0, 1).T).view(len(x), len(index), -1)
-            own.index_add_(1, index, part.double())
+            moments.index_add_(1, index, part.double())
 
     def expectation(
         self, parameters: Parameters, maps: Sequence[Tensor], points: Points, least: Tensor
     ) -> Expectation:
         """Add up the sums of all processes."""
         mass, total, *sums = points.processes.sum(self.mass, self.total, *self.moments)
-        rounded, bound = [own.double() for own in maps], float(total) / points.total
+        rounded, bound = [block_map.double() for block_map in maps], float(total) / points.total
         return Expectation(parameters, rounded, mass, sums, bound, least)
 
 
@@ -360,12 +368,12 @@ def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -
     alive = (mass > torch.finfo(mass.dtype).tiny)[:, None]
     divisor = torch.where(alive, mass[:, None], 1.0)
     means, covariances = [], []
-    for block, (maps, own) in enumerate(zip(expectation.maps, expectation.sums, strict=True)):
+    for block, (maps, sums) in enumerate(zip(expectation.maps, expectation.sums, strict=True)):
         width = maps.shape[1]
         whitening, offset = maps[..., :width], maps[..., width]
         # mean and scatter in whitened coordinates, where the old ones are 0 and the identity
-        shift = own[width] / divisor
-        scatter = own.permute(1, 2, 0) @ maps.mT / divisor[..., None]
+        shift = sums[width] / divisor
+        scatter = sums.permute(1, 2, 0) @ maps.mT / divisor[..., None]
         scatter = scatter - shift[..., None] * shift[:, None]
         scatter = torch.where(alive[..., None], scatter, torch.eye(width).to(scatter))
         back = torch.linalg.inv(whitening)
@@ -444,7 +452,7 @@ def restart_components(
 def _worst(parameters: Parameters, points: Points, count: int) -> Tensor:
     """Find the points of lowest density (count, sum D_j), worst first."""
     maps, peaks = whiten(parameters)
-    maps, peaks = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    maps, peaks = [block_map.to(points.dtype) for block_map in maps], peaks.to(points.dtype)
     worst = peaks.new_zeros(0, 1 + len(points.values))
     for chunk, _ in points:
         joint, _ = log_joint(points.blocks(chunk), maps, peaks, points.group_size)

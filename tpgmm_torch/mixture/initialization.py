@@ -73,7 +73,7 @@ def draw_starts(
         labellers = _bins_along_time(n_starts, n_components, points, rng)
     else:
         found = [torch.from_numpy(centers()) for _ in range(n_starts)]
-        labellers = [nearest(own.to(points.shift)) for own in found]
+        labellers = [nearest(start_centers.to(points.shift)) for start_centers in found]
     steps = (labelled_step(points, labeller, n_components) for labeller in labellers)
     return [m_step(step, family, floor=False) for step in steps]
 
@@ -87,7 +87,7 @@ def _bins_along_time(
     sample, numbers = points.sample(group_size)
     times = sample[:, 0].to(points.dtype)
     sizes = [bin_sizes(len(times), n_bins, rng if k else None) for k in range(n_starts)]
-    return [time_bins(times, numbers, own, group_size) for own in sizes]
+    return [time_bins(times, numbers, sizes_of_start, group_size) for sizes_of_start in sizes]
 
 
 def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> list[int]:
@@ -131,8 +131,8 @@ def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int)
     firsts = times.argsort(stable=True)[np.cumsum(sizes)[:-1]]
     limits, limit_numbers = times[firsts, None], numbers[firsts, None]
 
-    def labels(rows: Tensor, own: Tensor) -> Tensor:
-        time, number = rows[::group_size, 0], own[::group_size] // group_size
+    def labels(rows: Tensor, row_numbers: Tensor) -> Tensor:
+        time, number = rows[::group_size, 0], row_numbers[::group_size] // group_size
         beyond = (time > limits) | ((time == limits) & (number >= limit_numbers))
         return beyond.sum(0).repeat_interleave(group_size)
 

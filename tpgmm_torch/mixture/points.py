@@ -97,10 +97,10 @@ class Points:
             memory = self.scale.new_ones(len(piece) * height, dtype=self.dtype)
             numbers = torch.from_numpy(order + start + self._first).to(memory.device)
             for first in range(0, len(order), self._size):
-                own = order[first : first + self._size]
-                chunk = memory[first * height :][: len(own) * height].view(height, -1)
-                chunk[self.values] = self.standardize(piece[own]).T.to(self.dtype)
-                yield chunk, numbers[first : first + len(own)]
+                chunk_rows = order[first : first + self._size]
+                chunk = memory[first * height :][: len(chunk_rows) * height].view(height, -1)
+                chunk[self.values] = self.standardize(piece[chunk_rows]).T.to(self.dtype)
+                yield chunk, numbers[first : first + len(chunk_rows)]
 
     def standardize(self, rows: NDArray[np.floating]) -> Tensor:
         """Standardise rows (n, sum D_j) of the data, in float64."""
@@ -130,6 +130,6 @@ class Points:
             draws = np.random.RandomState(0).randint(0, len(wanted), FILE_ROWS)
             wanted = np.unique(draws)
         places = wanted * every - self._first
-        own = places[(places >= 0) & (places < len(self._rows))]
-        found = torch.cat(self.processes.gather(self.standardize(self._rows[own]).cpu()))
+        local_rows = places[(places >= 0) & (places < len(self._rows))]
+        found = torch.cat(self.processes.gather(self.standardize(self._rows[local_rows]).cpu()))
         return found.to(self.shift), torch.from_numpy(wanted).to(self.shift.device)

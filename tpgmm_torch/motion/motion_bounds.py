@@ -176,30 +176,30 @@ def _complete_rates(
 
 def _tighten_bound(name: str, kinematics: Kinematics, given: Any) -> Tensor:
     """Tighten the robot's own bound by the user's."""
-    own, joints = getattr(kinematics, name), kinematics.joint_names
-    if own is None:
-        own = torch.full_like(kinematics.lower, torch.inf)
-    own = own.double().clone()  # a file does not share them
+    limit, joints = getattr(kinematics, name), kinematics.joint_names
+    if limit is None:
+        limit = torch.full_like(kinematics.lower, torch.inf)
+    limit = limit.double().clone()  # a file does not share them
     if given is None:
-        return own
+        return limit
     if isinstance(given, Mapping):
-        values = own.clone()
+        values = limit.clone()
         for joint, value in given.items():
             if joint not in joints:
                 raise UnknownNameError("joint", joint, "the robot", joints)
             values[joints.index(joint)] = as_tensor(value, f"{name} of {joint!r}")
     else:
-        values = as_tensor(given, name).to(own)
-        if values.shape not in ((), own.shape):
+        values = as_tensor(given, name).to(limit)
+        if values.shape not in ((), limit.shape):
             raise ShapeError(
                 f"{name} is one number or one for each of the {len(joints)} joints, got shape "
                 f"{tuple(values.shape)}"
             )
-        values = values.expand_as(own)
-    wider = values < own if name == "lower" else values > own
+        values = values.expand_as(limit)
+    wider = values < limit if name == "lower" else values > limit
     if bool(wider.any()):
         which = wider.nonzero()[:, 0].tolist()
-        listed = [f"{joints[i]} {values[i]:g} (robot: {own[i]:g})" for i in which]
+        listed = [f"{joints[i]} {values[i]:g} (robot: {limit[i]:g})" for i in which]
         raise DataError(
             f"{name} is wider than the robot's own limit: {', '.join(listed)}; give a tighter "
             "one, or correct the description of the robot"

@@ -134,8 +134,8 @@ class _Translation:
             anchor = model.jnt_pos[joint] if is_hinge else np.zeros(3)
             is_last = joint == end - 1 and not anchor.any()
             far = link if is_last else self._free(f"{link}/{self.joint_names[joint]}")
-            one = self._joint(joint, near, far, before @ _pose(anchor))
-            self.joints.append(replace(one, mimic=mimics.get(joint)))
+            urdf_joint = self._joint(joint, near, far, before @ _pose(anchor))
+            self.joints.append(replace(urdf_joint, mimic=mimics.get(joint)))
             near, before = far, _pose(-anchor)
         if near != link:
             moved_from_outside = model.body_mocapid[body] >= 0
@@ -206,8 +206,8 @@ class _Translation:
         for index in np.flatnonzero(is_joint & is_line & (model.eq_active0 != 0)):
             joint, leader = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
             constant, slope = map(float, model.eq_data[index, :2])
-            own, other = (model.qpos0[model.jnt_qposadr[j]] for j in (joint, leader))
-            offset = float(own + constant - slope * other)
+            zero, leader_zero = (model.qpos0[model.jnt_qposadr[j]] for j in (joint, leader))
+            offset = float(zero + constant - slope * leader_zero)
             mimics.setdefault(joint, Mimic(self.joint_names[leader], slope, offset))
         return mimics
 

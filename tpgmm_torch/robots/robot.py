@@ -294,8 +294,8 @@ class Robot(Described):
         self.model = model
         self.joint_names = tuple(config["joints"])
         self.links = tuple(config["links"])
-        own = model.joint.keys() - config["coordinates"]
-        column = {name: i for i, name in enumerate(self.joint_names) if name in own}
+        moving = model.joint.keys() - config["coordinates"]
+        column = {name: i for i, name in enumerate(self.joint_names) if name in moving}
         self.lengths = tuple(
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )

@@ -338,7 +338,7 @@ def _most_common_holds(shown: Sequence[list[Hold]], agreement: float) -> list[Ho
     [(order, count)] = Counter(filter(None, orders)).most_common(1) or [((), 0)]
     if count < max(agreement * len(shown), 1):
         return []
-    alike = [holds for holds, own in zip(shown, orders, strict=True) if own == order]
+    alike = [holds for holds, links in zip(shown, orders, strict=True) if links == order]
     return _in_order(
         [
             replace(

@@ -146,5 +146,5 @@ def regularization(
     widths = block_widths(operators, kinematics)
     scales = moments.scales(widths, isotropic=covariance_type == "spherical")
     paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]
-    own = reg_covar * (1 + np.concatenate(paths) / scales**2)
-    return own + (np.concatenate(tolerances) / scales) ** 2
+    shares = reg_covar * (1 + np.concatenate(paths) / scales**2)
+    return shares + (np.concatenate(tolerances) / scales) ** 2

@@ -64,7 +64,7 @@ def with_force_axes(
 
 
 def _choose_axes(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
-    shares, sizes = (each.tolist() for each in shares_of_work(operator, motions))
+    shares, sizes = (values.tolist() for values in shares_of_work(operator, motions))
     every = list(zip("xyz", shares, sizes, strict=True))
     found = [s < NO_WORK and size >= operator.contact for _, s, size in every]
     if not any(found):
@@ -110,7 +110,7 @@ def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor,
             [speed] = torch.gradient(way, spacing=(motion.time,), dim=0)
             forces.append(local[touches, :3])
             speeds.append(speed[touches])
-    force, speed = (torch.cat(each) for each in (forces, speeds))
+    force, speed = (torch.cat(parts) for parts in (forces, speeds))
     if len(force) == sum(len(motion.time) for motion in motions):
         warnings.warn(ALWAYS.format(operator), PlausibilityWarning, stacklevel=2)
     if len(force) < 2:

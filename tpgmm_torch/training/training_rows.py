@@ -90,8 +90,8 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        each = (self.stored[start:stop] for start, stop in pairwise(self.edges))
-        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in each])
+        episodes = (self.stored[start:stop] for start, stop in pairwise(self.edges))
+        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in episodes])
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
@@ -104,12 +104,12 @@ class TrainingRows:
         """
         inside = (self.time >= begin) & (self.time < end)
         rows, stored = self.rows[:], self.stored[:]
-        own, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
-        if int(inside.sum()) < 2 or not own.any():
+        chosen, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
+        if int(inside.sum()) < 2 or not chosen.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
         edges = np.append(0, np.cumsum(kept))[self.edges]
         return replace(
-            self, rows=rows[own], time=self.time[inside], stored=stored[kept], edges=edges
+            self, rows=rows[chosen], time=self.time[inside], stored=stored[kept], edges=edges
         )
 
 
@@ -227,25 +227,26 @@ def read_rows(
     first = next(seen)
     shown = processes.gather([block.cpu() for block in first[1]])[0]
     side = like([block.to(kinematics.lower) for block in shown])
-    each = (
+    episodes = (
         match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
         for motion, blocks in chain([first], seen)
     )
-    stored, edges = _store_rows(each, alone)
+    stored, edges = _store_rows(episodes, alone)
     reference = _remove_rounding(stored, edges[1], operators, kinematics, processes)
     time, number = _typical_time(stored, edges, processes)
-    time, own = time.to(kinematics.lower), tuple(operators)
-    rows = TrainingRows(stored, 1, time, number, own, holds, processes, stored, edges)
+    rows = TrainingRows(
+        stored, 1, time.to(kinematics.lower), number, operators, holds, processes, stored, edges
+    )
     return _group_instants(
         rows, reference, responsibilities, block_widths(operators, kinematics)
     )
 
 
-def _store_rows(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
+def _store_rows(episodes: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
     """Store rows, in a file unless of one batch, and where each demonstration begins."""
     kept: Any = [] if alone else RowFile()
     lengths = [0]
-    for rows in each:
+    for rows in episodes:
         lengths.append(len(rows))
         kept.append(rows)
     return np.concatenate(kept) if alone else kept, np.cumsum(lengths)
@@ -293,8 +294,8 @@ def _group_instants(
         instants = stored.reshape(number, *first.shape).swapaxes(0, 1)
         return replace(rows, rows=instants.reshape(stored.shape), group_size=number)
     points, size = equivalent_rows(stored, first, widths, processes)
-    own = processes.share(range(len(points) // size))
-    return replace(rows, rows=points[own[0] * size : (own[-1] + 1) * size], group_size=size)
+    part = processes.share(range(len(points) // size))
+    return replace(rows, rows=points[part[0] * size : (part[-1] + 1) * size], group_size=size)
 
 
 def _typical_time(
@@ -302,8 +303,8 @@ def _typical_time(
 ) -> tuple[Tensor, int]:
     """Find the time grid of median duration, and count the demonstrations of all."""
     spans = [(float(stored[i, 0]), float(stored[j - 1, 0])) for i, j in pairwise(edges)]
-    own = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
-    everyone = list(chain.from_iterable(processes.gather(own)))
+    entries = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
+    everyone = list(chain.from_iterable(processes.gather(entries)))
     begins, durations, owners, places = zip(*everyone, strict=True)
     chosen = typical(begins, durations)
     place = places[chosen] if owners[chosen] == processes.rank else 0
@@ -354,8 +355,8 @@ def equivalent_rows(
     own_total = torch.zeros_like(origin)
     own_squares = [origin.new_zeros(len(origin), width, width) for width in widths]
     for start in range(0, len(rows), len(origin)):
-        one = np.asarray(rows[start : start + len(origin)], dtype=np.float64)
-        deviation = torch.from_numpy(one) - origin
+        episode = np.asarray(rows[start : start + len(origin)], dtype=np.float64)
+        deviation = torch.from_numpy(episode) - origin
         own_total += deviation
         for square, block in zip(own_squares, deviation.split(list(widths), 1), strict=True):
             square += block[:, :, None] * block[:, None, :]
