@@ -234,8 +234,9 @@ def read_rows(
     stored, edges = _store_rows(episodes, alone)
     reference = _remove_rounding(stored, edges[1], operators, kinematics, processes)
     time, number = _typical_time(stored, edges, processes)
+    time = time.to(kinematics.lower)
     rows = TrainingRows(
-        stored, 1, time.to(kinematics.lower), number, operators, holds, processes, stored, edges
+        stored, 1, time, number, tuple(operators), holds, processes, stored, edges
     )
     return _group_instants(
         rows, reference, responsibilities, block_widths(operators, kinematics)
