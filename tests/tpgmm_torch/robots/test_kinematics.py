@@ -98,14 +98,14 @@ class TestState:
             state.position("cup")
 
 
-def carried(joints: torch.Tensor, **options: Any) -> RobotState:
+def carry(joints: torch.Tensor, **options: Any) -> RobotState:
     return upper_body().state(joints).with_link("cup", "r_hand", CUP, **options)
 
 
 class TestObjects:
     def test_an_object_is_where_the_link_has_it(self) -> None:
         joints = random_joints(upper_body(), 5)
-        state, hand = carried(joints), upper_body().state(joints)
+        state, hand = carry(joints), upper_body().state(joints)
         where = Frame(hand.position("r_hand"), hand.orientation("r_hand"))
         torch.testing.assert_close(state.position("cup"), where.transform(CUP.position))
         matrix = quaternions.to_matrix(where.orientation) @ quaternions.to_matrix(
@@ -118,9 +118,9 @@ class TestObjects:
 
     def test_its_jacobian_is_the_derivative_of_its_pose(self) -> None:
         joints, size = random_joints(upper_body(), 4), 1e-6
-        state = carried(joints)
+        state = carry(joints)
         for column, unit in enumerate(torch.eye(17, dtype=torch.float64)):
-            ahead, behind = carried(joints + size * unit), carried(joints - size * unit)
+            ahead, behind = carry(joints + size * unit), carry(joints - size * unit)
             velocity = (ahead.position("cup") - behind.position("cup")) / (2 * size)
             back = quaternions.conjugate(behind.orientation("cup"))
             turn = quaternions.product(ahead.orientation("cup"), back)
@@ -147,16 +147,16 @@ class TestObjects:
         assert (state.position("cup")[1] == free.position).all()
         assert (state.orientation("cup")[1] == free.orientation).all()
         assert (state.jacobians[1, 2] == 0).all()
-        torch.testing.assert_close(state[2].position("cup"), carried(joints[2]).position("cup"))
+        torch.testing.assert_close(state[2].position("cup"), carry(joints[2]).position("cup"))
 
     def test_what_stands_on_a_carried_object_is_carried_by_the_same_link(self) -> None:
-        state = carried(random_joints(upper_body())).with_link("spoon", "cup", CUP)
+        state = carry(random_joints(upper_body())).with_link("spoon", "cup", CUP)
         assert state.carrier("spoon") == state.carrier("r_hand") == 1
         assert state.carrier("l_hand") == 0
         direct = Frame(
             CUP.transform(CUP.position), quaternions.product(CUP.orientation, CUP.orientation)
         )
-        other = carried(state.joints).with_link("spoon", "r_hand", direct)
+        other = carry(state.joints).with_link("spoon", "r_hand", direct)
         torch.testing.assert_close(state.jacobians, other.jacobians)
         with_other_cup = other.with_link("cup", "l_hand", CUP)
         assert with_other_cup.links == ("l_hand", "r_hand", "spoon", "cup")

@@ -42,14 +42,14 @@ from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.robots.urdf import read_urdf
 
 
-def published() -> list[Any]:
+def published_files() -> list[Any]:
     """The URDFs of a public collection of which something moves; one file of it is empty."""
     files = sorted(G1_PATH.parents[2].rglob("*.urdf"))
     moves = re.compile(rb'type="(revolute|continuous|prismatic)"')
     return [pytest.param(f, id=f.stem) for f in files if moves.search(f.read_bytes())]
 
 
-@pytest.mark.parametrize("file", published())
+@pytest.mark.parametrize("file", published_files())
 def test_published_robots_are_where_pinocchio_has_them(file: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)

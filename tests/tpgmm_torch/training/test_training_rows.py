@@ -120,7 +120,7 @@ def test_uneven_batches_have_no_instants():
 def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(monkeypatch):
     counts = Counter()
 
-    def counted(kind, name):
+    def count_calls(kind, name):
         method = getattr(kind, name)
 
         def counting(self, *given):
@@ -130,8 +130,8 @@ def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(
         monkeypatch.setattr(kind, name, counting)
 
     demonstrations = LinearTimeNormalization().fit_transform(few_bottles())
-    counted(Robot, "state")
-    counted(Motion, "coordinates")
+    count_calls(Robot, "state")
+    count_calls(Motion, "coordinates")
     model = bottle_model(8, tol=1e-1).fit(demonstrations)
     number = len(demonstrations)
     assert counts["coordinates"] == number * len(model.operators_)
