@@ -77,7 +77,7 @@ from tpgmm_torch.alignment import (
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics, Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 G1_URDF = (
     "cmeel.prefix/share/example-robot-data/robots/g1_description/urdf/g1_29dof_rev_1_0.urdf"
@@ -130,7 +130,7 @@ def pose(link: str, frame: str | None = None) -> Stack:
 def pouring(demonstration: Demonstration) -> float:
     """Find when the right hand is turned furthest away from its start [s]."""
     names = [f"right.{part}" for part in ("qw", "qx", "qy", "qz")]
-    turn = demonstration.reordered(names).joints
+    turn = demonstration.reorder(names).joints
     return float(demonstration.time[int((turn @ turn[0]).abs().argmin())])
 
 

@@ -32,29 +32,11 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "AbsoluteOrientation",
-    "AbsolutePosition",
-    "Canonical",
-    "Demonstration",
-    "Frame",
-    "Hold",
-    "RelativeOrientation",
-    "RelativePosition",
-    "Robot",
-    "SelectComponents",
-    "SelectOperators",
-    "Sequence",
-    "Situation",
-    "Stack",
-    "TaskParameterizedGMM",
-    "Trajectory",
-    "ViaPoints",
-    "Ways",
-    "attach_holds",
-    "find_holds",
-    "load",
-    "save",
-]
+    "AbsoluteOrientation", "AbsolutePosition", "Canonical", "Demonstration", "Frame",
+    "Hold", "RelativeOrientation", "RelativePosition", "Robot", "SelectComponents",
+    "SelectOperators", "Sequence", "Situation", "Stack", "TaskParameterizedGMM",
+    "Trajectory", "ViaPoints", "Ways", "attach_holds", "find_holds", "load", "save",
+]  # fmt: skip
 
 _HOMES = {
     "data.demonstrations": ("Demonstration", "Situation"),
@@ -62,12 +44,8 @@ _HOMES = {
     "data.frames": ("Frame",),
     "data.holds": ("Hold",),
     "operators": (
-        "AbsoluteOrientation",
-        "AbsolutePosition",
-        "Canonical",
-        "RelativeOrientation",
-        "RelativePosition",
-        "Stack",
+        "AbsoluteOrientation", "AbsolutePosition", "Canonical", "RelativeOrientation",
+        "RelativePosition", "Stack",
     ),
     "persistence": ("load", "save"),
     "robots.robot": ("Robot",),
@@ -78,7 +56,7 @@ _HOMES = {
     "structure.select_operators": ("SelectOperators",),
     "data.trajectories": ("Trajectory",),
     "training.hold_detection": ("attach_holds", "find_holds"),
-}
+}  # fmt: skip
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
 

@@ -20,7 +20,7 @@ LEFT_OVER = re.compile(r"\._.*|\.DS_Store|Thumbs\.db|desktop\.ini", re.IGNORECAS
 
 
 def contents(folder: Path) -> set[str]:
-    """Names of what is in a folder, without what file managers leave behind."""
+    """List what is in a folder, without what file managers leave behind."""
     return {item.name for item in folder.iterdir() if not LEFT_OVER.fullmatch(item.name)}
 
 
@@ -163,7 +163,7 @@ def _identity(path: Path) -> tuple[int, ...] | None:
 
 
 def read_whole(path: str | Path) -> bytes:
-    """The bytes of a file.
+    """Read the bytes of a file.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def read_whole(path: str | Path) -> bytes:
 
 
 def _beside(path: Path, kind: str) -> Path:
-    """Where the "new", the "previous" or the "lock" of ``path`` is."""
+    """Return the "new", the "previous" or the "lock" of ``path``."""
     return path.with_name(f".{path.name}.{kind}")
 
 

@@ -28,16 +28,11 @@ import numpy as np
 from numpy.random import RandomState
 from sklearn.base import BaseEstimator
 
-from tpgmm_torch.exceptions import DataError, InvalidParameterError, NotFittedError
+from tpgmm_torch.exceptions import InvalidParameterError, NotFittedError
 
 __all__ = [
-    "ANYTHING",
-    "DemonstrationEstimator",
-    "Interval",
-    "Options",
-    "check_parameters",
-    "check_positive",
-]
+    "ANYTHING", "DemonstrationEstimator", "Interval", "Options", "check_parameters",
+]  # fmt: skip
 
 #: Entry of a parameter that is checked elsewhere.
 ANYTHING: tuple[Any, ...] = (object,)
@@ -77,21 +72,22 @@ class Interval:
         if not isinstance(value, self.kind) or isinstance(value, BOOLEANS):
             return False
         number = float(value)  # type: ignore[arg-type]
-        left = self.low is not None and self.closed in ("left", "both")
-        right = self.high is not None and self.closed in ("right", "both")
-        low = -np.inf if self.low is None else self.low
-        high = np.inf if self.high is None else self.high
-        above = number >= low if left else number > low
-        below = number <= high if right else number < high
+        low, high, left, right = self._ends()
+        above = number >= low if left == "[" else number > low
+        below = number <= high if right == "]" else number < high
         return above and below  # NaN is neither
 
     def __str__(self) -> str:
+        low, high, left, right = self._ends()
+        kind = "an int" if self.kind is Integral else "a float"
+        return f"{kind} in the range {left}{low:g}, {high:g}{right}"
+
+    def _ends(self) -> tuple[float, float, str, str]:
+        """Return the bounds, and the brackets that say which are themselves among them."""
         left = "[" if self.closed in ("left", "both") and self.low is not None else "("
         right = "]" if self.closed in ("right", "both") and self.high is not None else ")"
-        low = "-inf" if self.low is None else f"{self.low:g}"
-        high = "inf" if self.high is None else f"{self.high:g}"
-        kind = "an int" if self.kind is Integral else "a float"
-        return f"{kind} in the range {left}{low}, {high}{right}"
+        low = -np.inf if self.low is None else self.low
+        return low, np.inf if self.high is None else self.high, left, right
 
 
 @dataclass(frozen=True)
@@ -135,27 +131,6 @@ def check_parameters(estimator: Any) -> None:
             raise InvalidParameterError(
                 f"the {name!r} parameter of {type(estimator).__name__} must be {allowed}, "
                 f"not {values[name]!r}"
-            )
-
-
-def check_positive(settings: Any, *may_vanish: str) -> None:
-    """Check that all fields of a dataclass are numbers above 0; infinity is one.
-
-    Parameters
-    ----------
-    settings : dataclass
-    *may_vanish : str
-        Fields that may also be 0.
-
-    Raises
-    ------
-    DataError
-        If one of them is not.
-    """
-    for name, value in vars(settings).items():
-        if not (value > 0 or (value == 0 and name in may_vanish)):
-            raise DataError(
-                f"{name} of {type(settings).__name__} is a positive number, got {value!r}"
             )
 
 

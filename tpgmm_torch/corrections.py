@@ -82,7 +82,7 @@ def _placed(
     kinematics, grid = skill.kinematics, skill.time
     if len(shown) < 2:
         raise DataError(f"demonstration {number} has one time step: it shows no motion")
-    shown = shown.reordered(kinematics.joint_names)
+    shown = shown.reorder(kinematics.joint_names)
     count = min(n_steps, max(len(grid), 2))
     time = torch.linspace(float(grid[0]), float(grid[-1]), count, dtype=grid.dtype)
     situation = Situation(shown.joints[0], Situation.of(shown).frames, time)
@@ -115,7 +115,7 @@ def _placed(
     events = {name: clock(instant) for name, instant in shown.events.items()}
     holds = shown.holds
     if holds is not None:
-        holds = tuple(hold.retimed(clock) for hold in holds)
+        holds = tuple(hold.retime(clock) for hold in holds)
     return replace(shown, time=clock(shown.time), events=events, holds=holds)
 
 

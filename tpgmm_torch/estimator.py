@@ -24,7 +24,7 @@ from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.skills.reproduction import reproduce, sample
 from tpgmm_torch.skills.situations import report_start, tick_inputs
-from tpgmm_torch.training.learning import Learned, known, learn
+from tpgmm_torch.training.learning import Learned, from_parameters, learn
 from tpgmm_torch.training.local_data import local_data
 
 __all__ = ["TaskParameterizedGMM"]
@@ -404,7 +404,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
             Of the demonstrations.
         **settings
             Parameters of the constructor, ``robot`` among them:
-            :class:`~tpgmm_torch.robots.joint_space.JointSpace` where operators need no links.
+            :class:`~tpgmm_torch.robots.kinematics.JointSpace` where operators need no links.
 
         Returns
         -------
@@ -418,7 +418,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         model = cls(**{"n_components": len(weights)} | settings)
         check_parameters(model)
         mixture = weights, means, covariances
-        learned = known(
+        learned = from_parameters(
             *mixture, time, model.get_params(deep=False),
             holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary,
         )  # fmt: skip

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,21 +22,10 @@ from tpgmm_torch.data.pose_names import is_gripper, pose_groups, words
 from tpgmm_torch.training.hold_detection import find_holds
 
 __all__ = [
-    "LEAST_CONFIDENCE",
-    "Boundary",
-    "between_levels",
-    "crossing_time",
-    "find_boundaries",
-    "find_contacts",
-    "find_gripper_changes",
-    "find_stops",
-    "gripper_groups",
-    "high_stretches",
-    "level_changes",
-    "move_start",
-    "smooth_speed",
-    "without_spikes",
-]
+    "LEAST_CONFIDENCE", "Boundary", "between_levels", "crossing_time", "find_boundaries",
+    "find_contacts", "find_gripper_changes", "find_stops", "gripper_groups",
+    "high_stretches", "level_changes", "move_start", "smooth_speed", "without_spikes",
+]  # fmt: skip
 
 #: Confidence, from 0 to 1, below which nothing is an event.
 LEAST_CONFIDENCE = 0.2
@@ -72,11 +61,18 @@ class Boundary:
     end: float
     prepares: bool = False
 
+    def join_stop(self, stop: Boundary) -> Boundary:
+        """Join the boundary with a ``stop`` at which it happens."""
+        # poses alone locate a contact less exactly than a stop
+        exact = self.begin < self.end and stop.begin <= self.time <= stop.end
+        time = self.time if exact else stop.time
+        return replace(self, time=time, reason=f"{self.reason}, stop", prepares=False)
+
 
 def find_boundaries(
     demonstration: Demonstration, robot: Any = None, *, margin: float = 0.05
 ) -> list[Boundary]:
-    """All instants at which one part may end and another begin, in the order of time.
+    """Find all instants at which one part may end and another begin, in order.
 
     A stop at which a gripper moves or something is taken or let go is one boundary with these.
 
@@ -105,22 +101,20 @@ def find_boundaries(
     for stop in find_stops(demonstration, robot):
         early, late = stop.begin - near_by, stop.end + near_by
         near = [i for i, one in enumerate(found) if early <= one.time <= late]
-        for i in near:  # poses alone locate a contact less exactly than a stop
-            exact = found[i].begin < found[i].end and stop.begin <= found[i].time <= stop.end
-            time = found[i].time if exact else stop.time
-            reason = f"{found[i].reason}, stop"
-            found[i] = replace(found[i], time=time, reason=reason, prepares=False)
+        for i in near:
+            found[i] = found[i].join_stop(stop)
         if not near:
             found.append(stop)
     return sorted((one for one in found if not one.prepares), key=lambda one: one.time)
 
 
 def find_gripper_changes(demonstration: Demonstration) -> list[Boundary]:
-    """Each closing and opening of each gripper, known by the names of the signals.
+    """Find each closing and opening of each gripper, known by the names of the signals.
 
     Parameters
     ----------
     demonstration : Demonstration
+        Of at least two time steps.
     """
     time, values = as_array(demonstration.time), as_array(demonstration.joints)
     names = demonstration.joint_names or ()
@@ -136,11 +130,12 @@ def find_gripper_changes(demonstration: Demonstration) -> list[Boundary]:
 
 
 def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Boundary]:
-    """When objects that were recorded over time are taken and let go, or begin to move.
+    """Find when objects that were recorded over time are taken and let go, or begin to move.
 
     Parameters
     ----------
     demonstration : Demonstration
+        Of at least two time steps.
     robot : Kinematics, optional
         Whose links take them.
     """
@@ -148,12 +143,19 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
     holds = () if robot is None else find_holds([demonstration], robot)
     happen = [(hold.begin, f"{hold.frame} is taken") for hold in holds]
     happen += [(hold.end, f"{hold.frame} is let go") for hold in holds]
-    held = {hold.frame for hold in holds}
-    for name, frame in demonstration.frames.items():
-        if name not in held and frame.batch_shape:
-            at, sure = move_start(as_array(frame.position), as_array(demonstration.time))
-            happen += [(at, f"{name} moves")] if sure >= LEAST_CONFIDENCE else []
+    happen += _object_moves(demonstration, {hold.frame for hold in holds})
     return [Boundary(at, reason, at, at) for at, reason in happen if begin < at < end]
+
+
+def _object_moves(
+    demonstration: Demonstration, others: Collection[str]
+) -> Iterator[tuple[float, str]]:
+    """Yield when each object begins to move that is not among others, and the reason."""
+    for name, frame in demonstration.frames.items():
+        if name not in others and frame.batch_shape:
+            at, sure = move_start(as_array(frame.position), as_array(demonstration.time))
+            if sure >= LEAST_CONFIDENCE:
+                yield at, f"{name} moves"
 
 
 def find_stops(
@@ -164,7 +166,7 @@ def find_stops(
     rest: float = 0.15,
     motion: float = 0.5,
 ) -> list[Boundary]:
-    """When the whole robot comes to rest between two motions; rhythms go on.
+    """Find when the whole robot comes to rest between two motions; rhythms go on.
 
     A rhythm has no speed where it turns back either, but does not stay there: how long there is
     next to none, of the time in which there is little, tells them apart.
@@ -188,7 +190,7 @@ def find_stops(
     Hogan, Sternad: On rhythmic and discrete movements: reflections, definitions and
     implications for motor control, Experimental Brain Research 181 (2007).
     """
-    time, speed = as_array(demonstration.time), _speed(demonstration, robot)
+    time, speed = as_array(demonstration.time), _robot_speed(demonstration, robot)
     peak = float(np.quantile(speed, 0.98))
     if peak <= 0:
         return []
@@ -213,30 +215,34 @@ def find_stops(
 
 
 def _crossing(time: Array, speed: Array, below: int, way: int, limit: float) -> float:
-    """When a limit is crossed between a step that is below it and the one before or after."""
+    """Find when a limit is crossed between a step below it and the one before or after."""
     pair = [below, below + way]
     return float(np.interp(limit, speed[pair], time[pair]))
 
 
-def _speed(demonstration: Demonstration, robot: Any) -> Array:
-    """Of all links together, of the joints but for grippers without links, smoothed, (T,)."""
-    time, names = as_array(demonstration.time), demonstration.joint_names or ()
+def _robot_speed(demonstration: Demonstration, robot: Any) -> Array:
+    """Compute the speed of all links together, or of joints but for grippers, (T,)."""
     if robot is not None and robot.links:
-        state = robot.state(demonstration.reordered(robot.joint_names).joints)
-        columns = [as_array(state.position(link)) for link in robot.links]
-        if getattr(robot, "orientation", True):  # tracked points have none
-            turns = [quaternions.continuous(state.orientation(link)) for link in robot.links]
-            columns += [2 * LEVER * as_array(turn) for turn in turns]  # half the angle
-        values = np.concatenate(columns, axis=1)
+        values = _link_coordinates(demonstration, robot)
     else:
-        joints = as_array(demonstration.joints)
-        grippers = {j for j, name in enumerate(names) if is_gripper(name)}
-        values = joints[:, [j for j in range(joints.shape[1]) if j not in grippers]]
-    return smooth_speed(values, time, SMOOTHING)
+        joints, names = as_array(demonstration.joints), demonstration.joint_names or ()
+        grippers = [j for j, name in enumerate(names) if is_gripper(name)]
+        values = np.delete(joints, grippers, axis=1)
+    return smooth_speed(values, as_array(demonstration.time), SMOOTHING)
+
+
+def _link_coordinates(demonstration: Demonstration, robot: Any) -> Array:
+    """Compute positions of all links, and their orientations as lengths, (T, D)."""
+    state = robot.state(demonstration.reorder(robot.joint_names).joints)
+    columns = [as_array(state.position(link)) for link in robot.links]
+    if getattr(robot, "orientation", True):  # tracked points have none
+        turns = [quaternions.continuous(state.orientation(link)) for link in robot.links]
+        columns += [2 * LEVER * as_array(turn) for turn in turns]  # half the angle
+    return np.concatenate(columns, axis=1)
 
 
 def smooth_speed(values: Array, time: Array, length: float) -> Array:
-    """Norm of the rates of change (T,) of values (T, n), as means over a length of time [s]."""
+    """Compute the norm of rates of change (T,) of values (T, n), over a length of time [s]."""
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     rates = np.gradient(values, time, axis=0)
     smooth = uniform_filter1d(rates, 2 * half + 1, axis=0, mode="nearest")
@@ -247,7 +253,7 @@ def smooth_speed(values: Array, time: Array, length: float) -> Array:
 def move_start(
     position: Array, time: Array, *, left: float = 0.02, away: float = 0.1
 ) -> tuple[float, float]:
-    """When an object with ``position`` (T, 3) at ``time`` leaves its place, and the confidence.
+    """Find when an object with ``position`` (T, 3) leaves its place, and the confidence.
 
     It is the last instant at which the object was within the share ``left`` of its largest
     distance from where it lay, before it came to ``away``. The confidence is the product of
@@ -268,14 +274,14 @@ def move_start(
 
 
 def without_spikes(values: Array, time: Array, length: float = 0.1) -> Array:
-    """Medians of signals ``values`` (T, n) at ``time`` (T,) over a ``length`` of time [s]."""
+    """Filter signals ``values`` (T, n) at ``time`` (T,) by medians over a ``length`` [s]."""
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     filtered: Array = median_filter(values, size=(2 * half + 1, 1), mode="nearest")
     return filtered
 
 
 def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
-    """Columns of the signals of each gripper; the fingers of one side's hand are one.
+    """Group signals by gripper; the fingers of one side's hand are one.
 
     Parameters
     ----------
@@ -294,17 +300,18 @@ def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
             side = "".join(sorted({"left", "right"} & {*words(name)}))
             groups.setdefault(side, []).append(i)
     return {
-        names[own[0]] if len(own) == 1 else f"{side} hand".strip(): own
-        for side, own in groups.items()
+        names[columns[0]] if len(columns) == 1 else f"{side} hand".strip(): columns
+        for side, columns in groups.items()
     }
 
 
 def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]:
-    """All changes of signals between their two levels.
+    """Find all changes of signals between their two levels.
 
     Parameters
     ----------
     time : array of shape (T,)
+        Ascending instants [s].
     values : array of shape (T, n)
         Which count as one: their first principal component.
 
@@ -330,7 +337,7 @@ def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]
 
 
 def _principal(values: Array) -> Array:
-    """One signal of shape (T,) for several (T, n): what most of them do, they do."""
+    """Compute one signal of shape (T,) for several (T, n): what most of them do."""
     if values.shape[1] == 1:
         return values[:, 0]
     weights = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)[2][0]
@@ -339,7 +346,7 @@ def _principal(values: Array) -> Array:
 
 
 def between_levels(values: Array) -> tuple[Array, float]:
-    """Signals ``values`` (T, n) from their low level (0) to the high one (1), and the contrast.
+    """Scale signals ``values`` (T, n) from the low level (0) to the high one (1); contrast.
 
     Several count as one, their first principal component. Its levels are the medians of the two
     classes of Otsu [1]_. The contrast is one less twice the standard deviation within the
@@ -361,7 +368,7 @@ def between_levels(values: Array) -> tuple[Array, float]:
 
 
 def _levels(values: Array) -> tuple[float, float, float]:
-    """Medians of the two classes that differ most, and the deviation within them."""
+    """Find medians of the two classes that differ most, and the deviation within them."""
     ordered = np.sort(values)
     count = np.arange(1, len(ordered))
     sums = ordered.cumsum()
@@ -375,7 +382,7 @@ def _levels(values: Array) -> tuple[float, float, float]:
 def crossing_time(
     time: Array, share: Array, start: int, stop: int, edge: str
 ) -> tuple[float, float]:
-    """When a signal passes ``ON`` at an edge [s], and how long that took from ``1 - ON``.
+    """Find when a signal passes ``ON`` at an edge [s], and how long that took.
 
     Parameters
     ----------
@@ -396,11 +403,12 @@ def crossing_time(
 
 
 def high_stretches(values: Array, on: float, off: float) -> list[tuple[int, int]]:
-    """Stretches that begin where values reach ``on`` and last until they are below ``off``.
+    """Find stretches from where values reach ``on`` until they are below ``off``.
 
     Parameters
     ----------
     values : array of shape (T,)
+        A signal.
     on, off : float
         The larger and the smaller threshold; between them nothing changes.
 

@@ -10,21 +10,11 @@ from sklearn.exceptions import ConvergenceWarning as SklearnConvergenceWarning
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 
 __all__ = [
-    "ConvergenceWarning",
-    "DataError",
-    "DegenerateComponentWarning",
-    "DependencyError",
-    "DistributedError",
-    "InvalidParameterError",
-    "MissingLimitsWarning",
-    "ModelFileError",
-    "NotFittedError",
-    "PlausibilityError",
-    "PlausibilityWarning",
-    "ShapeError",
-    "TPGMMError",
-    "UnknownNameError",
-]
+    "ConvergenceWarning", "DataError", "DegenerateComponentWarning", "DependencyError",
+    "DistributedError", "InvalidParameterError", "MissingLimitsWarning", "ModelFileError",
+    "NotFittedError", "PlausibilityError", "PlausibilityWarning", "ShapeError",
+    "TPGMMError", "UnknownNameError",
+]  # fmt: skip
 
 
 class TPGMMError(Exception):

@@ -16,18 +16,9 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "block_diagonal",
-    "cholesky",
-    "common_shape",
-    "condition",
-    "from_information",
-    "information",
-    "log_density",
-    "moment_match",
-    "product",
-    "pseudo_inverse",
-    "whiten",
-]
+    "block_diagonal", "cholesky", "common_shape", "condition", "from_information",
+    "information", "log_density", "moment_match", "product", "pseudo_inverse", "whiten",
+]  # fmt: skip
 
 
 #: Up to this many numbers Python is faster than an operation of the library.
@@ -35,18 +26,19 @@ FEW = 64
 
 
 def common_shape(*shapes: torch.Size) -> torch.Size:
-    """:func:`torch.broadcast_shapes`, whose first call takes most of a second of imports."""
+    """Broadcast shapes; torch takes most of a second for its first."""
     if len(set(shapes)) == 1:
         return shapes[0]
     return torch.Size(np.broadcast_shapes(*shapes))
 
 
 def block_diagonal(matrices: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
-    """One matrix with others on its diagonal, zero elsewhere.
+    """Join matrices on the diagonal of one, zero elsewhere.
 
     Parameters
     ----------
     matrices : sequence of Tensor of shape (..., m, n)
+        From the upper left on.
     batch : sequence of int
         Shape of the batch, with which theirs broadcast.
     """
@@ -60,7 +52,7 @@ def block_diagonal(matrices: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
 
 
 def cholesky(matrix: Tensor, name: str) -> Tensor:
-    """Lower Cholesky factors, with an error that names the matrix.
+    """Compute lower Cholesky factors, with an error that names the matrix.
 
     Parameters
     ----------
@@ -86,7 +78,7 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
 
 
 def whiten(covariance: Tensor, right: Tensor, name: str) -> Tensor:
-    """``L^-1 R`` with ``L L^T`` the covariance: residuals in units of their deviations.
+    """Compute ``L^-1 R`` with ``L L^T`` the covariance: residuals in their deviations.
 
     Parameters
     ----------
@@ -109,7 +101,7 @@ def whiten(covariance: Tensor, right: Tensor, name: str) -> Tensor:
 
 
 def _eliminate(covariance: Tensor, right: Tensor) -> Tensor:
-    """:func:`whiten` row by row: loops that a compiler joins with what stands around them."""
+    """Compute :func:`whiten` row by row: loops that a compiler joins with others."""
     size = covariance.shape[-1]
     matrix, rows = torch.cat((covariance, right), -1), []
     for left in range(size, 0, -1):  # what is left of the covariance
@@ -121,7 +113,7 @@ def _eliminate(covariance: Tensor, right: Tensor) -> Tensor:
 
 
 def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """Normalised product of P Gaussians in covariance form, eq. (2) as printed.
+    """Compute the normalised product of P Gaussians in covariance form, eq. (2).
 
     Parameters
     ----------
@@ -150,7 +142,7 @@ def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
 def information(
     jacobian: Tensor | None, targets: Tensor, covariance: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Information about ``x`` in ``J x = y``, given with covariance ``S``.
+    """Compute the information about ``x`` in ``J x = y``, given with covariance ``S``.
 
     ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank,
     so that sums of these terms are the product (2) of the projected Gaussians
@@ -202,7 +194,7 @@ def information(
 
 
 def from_information(precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``precision^-1 vector`` and covariance ``precision^-1`` of a Gaussian.
+    """Compute mean ``precision^-1 vector`` and covariance ``precision^-1``.
 
     Parameters
     ----------
@@ -220,7 +212,7 @@ def from_information(precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]
 
 
 def condition(mean: Tensor, covariance: Tensor, n_inputs: int) -> tuple[Tensor, Tensor]:
-    """Gaussian mixture regression of one Gaussian: outputs given the first coordinates.
+    """Condition a Gaussian on its first coordinates: regression of the others.
 
     ``E[x_o | x_i] = mean_o + gain (x_i - mean_i)``.
 
@@ -252,7 +244,7 @@ def condition(mean: Tensor, covariance: Tensor, n_inputs: int) -> tuple[Tensor, 
 
 
 def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of a mixture (law of total variance).
+    """Compute mean and covariance of a mixture (law of total variance).
 
     Parameters
     ----------
@@ -284,13 +276,14 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
 def log_density(
     residuals: Tensor, covariance: Tensor, name: str, degrees: float | None = None
 ) -> Tensor:
-    """Logarithm of the density of deviations from a mean, (..., r), in nats.
+    """Compute the log-density of deviations from a mean, (..., r), in nats.
 
     Parameters
     ----------
     residuals : Tensor of shape (..., D, r)
         Deviations, as columns.
     covariance : Tensor of shape (..., D, D)
+        Positive definite.
     name : str
         How the error message calls the covariance.
     degrees : float, optional
@@ -321,7 +314,7 @@ def log_density(
 
 
 def pseudo_inverse(matrix: Tensor) -> Tensor:
-    """The Moore-Penrose inverse ``J^+``, of eq. (1)'s A and b.
+    """Compute the Moore-Penrose inverse ``J^+``, of eq. (1)'s A and b.
 
     Where every ``matrix`` (..., m, n) is well conditioned it is ``J^T (J J^T)^-1``: a singular
     value decomposition takes some ten times as long.

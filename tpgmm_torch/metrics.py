@@ -24,16 +24,9 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = [
-    "Instants",
-    "PoseErrors",
-    "PoseScorer",
-    "joint_rmse",
-    "largest_acceleration",
-    "largest_speeds",
-    "largest_velocity",
-    "pose_errors",
-    "reproduction_scorer",
-]
+    "Instants", "PoseErrors", "PoseScorer", "joint_rmse", "largest_acceleration",
+    "largest_speeds", "largest_velocity", "pose_errors", "reproduction_scorer",
+]  # fmt: skip
 
 
 #: An event's name, or an instant or several [s].
@@ -41,7 +34,7 @@ Instants = str | float | Sequence[float] | Tensor
 
 
 def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
-    """Root mean square joint difference over equal time grids [rad].
+    """Compute the root mean square joint difference over equal time grids [rad].
 
     The joints of the ``demonstration`` may have another order than those of the
     ``trajectory``, if they are named. Quaternions among them, known by their names
@@ -52,7 +45,7 @@ def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
     ShapeError
         If the time grids or the joints differ.
     """
-    wanted = demonstration.reordered(trajectory.joint_names).joints
+    wanted = demonstration.reorder(trajectory.joint_names).joints
     if wanted.shape != trajectory.joints.shape:
         raise ShapeError(
             f"the trajectory has shape {tuple(trajectory.joints.shape)}, "
@@ -96,7 +89,7 @@ def pose_errors(
     link: str,
     at: Instants | None = None,
 ) -> PoseErrors:
-    """Errors of a link's pose: along the path, at instants, or at an event.
+    """Compute errors of a link's pose: along the path, at instants, or at an event.
 
     Parameters
     ----------
@@ -138,7 +131,7 @@ def pose_errors(
     if link not in robot.links:
         raise UnknownNameError("link", link, "the robot", robot.links)
     instants = _instants(at, demonstration)
-    shown = demonstration.reordered(robot.joint_names)
+    shown = demonstration.reorder(robot.joint_names)
     found = _state_at(trajectory.time, trajectory.joints, instants, robot)
     wanted = _state_at(shown.time, shown.joints, instants, robot)
     distance = torch.linalg.vector_norm(found.position(link) - wanted.position(link), dim=-1)
@@ -166,7 +159,7 @@ def _instants(at: Instants | None, demonstration: Demonstration) -> Tensor:
 
 
 def _state_at(time: Tensor, joints: Tensor, instants: Tensor, robot: Kinematics) -> RobotState:
-    """The robot between time steps."""
+    """Interpolate the robot between time steps."""
     joints = joints.to(robot.lower, copy=True)
     for place in robot.quaternion_starts:
         block = slice(place, place + 4)
@@ -217,7 +210,7 @@ class PoseScorer:
             )
 
     def __call__(self, estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
-        """Minus the mean over demonstrations and links; higher is better.
+        """Score by minus the mean over demonstrations and links; higher is better.
 
         Parameters
         ----------
@@ -246,7 +239,7 @@ class PoseScorer:
 def _reproductions(
     estimator: Any, X: Sequence[Demonstration]
 ) -> tuple[Any, list[tuple[Trajectory, Demonstration]]]:
-    """The model, and its reproductions beside demonstrations, aligned by steps before it."""
+    """Return the model, and its reproductions beside demonstrations, aligned before."""
     model, demonstrations = estimator, check_demonstrations(X)
     if isinstance(estimator, Pipeline):
         before, model = estimator[:-1], estimator[-1]
@@ -257,7 +250,7 @@ def _reproductions(
 
 
 def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
-    """Minus the joint RMSE of reproductions in the situations of held-out demonstrations [rad].
+    """Score by minus the joint RMSE in situations of held-out demonstrations [rad].
 
     For ``cross_val_score(..., scoring=reproduction_scorer)`` and ``GridSearchCV``; unlike the
     likelihood it compares models with different operators. Where a pose matters rather than
@@ -277,7 +270,7 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
 
 
 def largest_velocity(motion: Trajectory | Demonstration) -> float:
-    """Largest joint speed of a ``motion`` by first differences [rad/s].
+    """Compute the largest joint speed of a ``motion`` by first differences [rad/s].
 
     Examples
     --------
@@ -288,7 +281,7 @@ def largest_velocity(motion: Trajectory | Demonstration) -> float:
 
 
 def largest_speeds(motion: Trajectory | Demonstration) -> Tensor:
-    """Largest speed of each joint of a ``motion``, (n_joints,), by first differences [rad/s].
+    """Compute the largest speed (n_joints,) of each joint of a ``motion`` [rad/s].
 
     Examples
     --------
@@ -299,7 +292,7 @@ def largest_speeds(motion: Trajectory | Demonstration) -> Tensor:
 
 
 def largest_acceleration(motion: Trajectory | Demonstration) -> float:
-    """Largest joint acceleration of a ``motion`` by second differences [rad/s^2].
+    """Compute the largest joint acceleration of a ``motion`` [rad/s^2], by second differences.
 
     Examples
     --------

@@ -39,8 +39,7 @@ from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.robots.joint_space import JointSpace
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.kinematics import JointSpace, Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.skills.sequence import Sequence

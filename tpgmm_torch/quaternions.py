@@ -22,29 +22,11 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 
 __all__ = [
-    "conjugate",
-    "continuous",
-    "exp",
-    "from_matrix",
-    "hemisphere_sign",
-    "hemisphere_signs",
-    "identity",
-    "interpolate",
-    "inverse_left_jacobian",
-    "left_jacobian",
-    "left_matrix",
-    "log",
-    "match_hemisphere",
-    "mean",
-    "normalize",
-    "product",
-    "quaternion_blocks",
-    "right_matrix",
-    "rotate",
-    "slerp",
-    "to_matrix",
-    "vector_matrix",
-]
+    "conjugate", "continuous", "exp", "from_matrix", "hemisphere_sign", "hemisphere_signs",
+    "identity", "interpolate", "inverse_left_jacobian", "left_jacobian", "left_matrix",
+    "log", "match_hemisphere", "mean", "normalize", "product", "quaternion_blocks",
+    "right_matrix", "rotate", "slerp", "to_matrix", "vector_matrix",
+]  # fmt: skip
 
 
 #: Which entry of q = (q_1, q_2, q_3, q_4) stands where in H+(q) of eq. (20), with its sign.
@@ -90,7 +72,7 @@ def quaternion_blocks(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Tensor:
-    """Where quaternions are among ``size`` coordinates: a row of ones and zeros for each."""
+    """Mark quaternions among ``size`` coordinates: a row of ones and zeros for each."""
     with torch.inference_mode(False):
         blocks = torch.zeros(len(starts), size, dtype=dtype, device=device)
         for block, start in zip(blocks, starts, strict=True):
@@ -99,12 +81,12 @@ def quaternion_blocks(
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
-    """The quaternion of no rotation, ``(1, 0, 0, 0)``, of that ``dtype`` on that ``device``."""
+    """Return the quaternion of no rotation, of that ``dtype``, on that ``device``."""
     return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product ``a * b`` (eq. 18).
+    """Compute the Hamilton product ``a * b`` (eq. 18).
 
     Examples
     --------
@@ -116,22 +98,22 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The conjugate ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion ``q``."""
+    """Compute ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion ``q``."""
     return q * _constant("conjugate", q)
 
 
 def left_matrix(q: Tensor) -> Tensor:
-    """``H+(q)`` of eq. (20), (..., 4, 4): ``product(q, b) == left_matrix(q) @ b``."""
+    """Compute ``H+(q)`` of eq. (20): ``product(q, b) == left_matrix(q) @ b``."""
     return (q @ _constant("left", q)).unflatten(-1, (4, 4))
 
 
 def right_matrix(q: Tensor) -> Tensor:
-    """``Hbar(q)`` of eq. (20), (..., 4, 4): ``product(a, q) == right_matrix(q) @ a``."""
+    """Compute ``Hbar(q)`` of eq. (20): ``product(a, q) == right_matrix(q) @ a``."""
     return (q @ _constant("right", q)).unflatten(-1, (4, 4))
 
 
 def vector_matrix(q: Tensor) -> Tensor:
-    """``Hbar*(q)`` of eq. (11), (..., 3, 4): the lower three rows of :func:`right_matrix`.
+    """Compute ``Hbar*(q)`` of eq. (11): the lower three rows of :func:`right_matrix`.
 
     ``vector_matrix(q) @ a`` is the vector part of ``a * q``.
     """
@@ -153,7 +135,7 @@ def normalize(q: Tensor) -> Tensor:
 
 
 def hemisphere_sign(inner: Tensor) -> Tensor:
-    """The sign, 1 or -1, that brings a quaternion into the hemisphere of a reference.
+    """Return the sign, 1 or -1, that brings a quaternion to the side of a reference.
 
     Parameters
     ----------
@@ -165,7 +147,7 @@ def hemisphere_sign(inner: Tensor) -> Tensor:
 
 
 def hemisphere_signs(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,)) -> Tensor:
-    """Signs (..., D) that bring quaternions among coordinates to the side of the reference.
+    """Return signs (..., D) that bring quaternions among coordinates to the reference.
 
     Parameters
     ----------
@@ -185,11 +167,12 @@ def hemisphere_signs(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,))
 
 
 def match_hemisphere(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,)) -> Tensor:
-    """Of q and -q, which are one rotation, the one whose inner product is not negative.
+    """Choose of q and -q, one rotation, that whose inner product is not negative.
 
     Parameters
     ----------
     x, reference : Tensor of shape (..., D)
+        Coordinates, and those to which sides are compared.
     starts : sequence of int, default=(0,)
         Where quaternions begin among the coordinates; others stay as they are.
     """
@@ -221,7 +204,7 @@ def continuous(q: Tensor, dim: int = -2, starts: Sequence[int] = (0,)) -> Tensor
 
 
 def exp(rotation_vector: Tensor) -> Tensor:
-    """Unit quaternion of a ``rotation_vector`` (axis times angle, rad).
+    """Compute the unit quaternion of a ``rotation_vector`` (axis times angle, rad).
 
     Examples
     --------
@@ -239,7 +222,7 @@ def exp(rotation_vector: Tensor) -> Tensor:
 
 
 def log(q: Tensor) -> Tensor:
-    """Rotation vector (axis times angle in [0, pi], rad) of a unit quaternion.
+    """Compute the rotation vector (axis times angle in [0, pi], rad) of a unit quaternion.
 
     ``q`` and ``-q`` give the same vector, the shorter of the two ways; at half a turn, where
     both are equally long, opposite ones.
@@ -255,7 +238,7 @@ def log(q: Tensor) -> Tensor:
 
 
 def left_jacobian(rotation_vector: Tensor) -> Tensor:
-    """``J_l(y)`` (..., 3, 3) of a ``rotation_vector`` y: how ``exp(y)`` turns when y changes.
+    """Compute ``J_l(y)`` of a ``rotation_vector`` y: how ``exp(y)`` turns with y.
 
     ``exp(y + dy) = exp(J_l(y) dy) exp(y)`` to first order.
 
@@ -270,13 +253,13 @@ def left_jacobian(rotation_vector: Tensor) -> Tensor:
     0.811
     """
     eye, cross, square, angle, small = _cross_and_angle(rotation_vector)
-    one = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
-    two = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
-    return eye + one * cross + two * cross @ cross
+    first = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
+    second = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
+    return eye + first * cross + second * cross @ cross
 
 
 def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:
-    """The inverse of :func:`left_jacobian` (eq. 146).
+    """Compute the inverse of :func:`left_jacobian` (eq. 146).
 
     Parameters
     ----------
@@ -290,7 +273,7 @@ def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:
 
 
 def _cross_and_angle(vector: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """I, ``[y]x``, and ``|y|^2``, ``|y|`` (1 where it is small) and whether it is."""
+    """Compute I, ``[y]x``, ``|y|^2``, ``|y|`` (1 where small) and whether it is small."""
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device).expand(*vector.shape, 3)
     cross = torch.linalg.cross(vector.unsqueeze(-1).expand_as(eye), eye, dim=-2)
     square = vector.square().sum(-1)[..., None, None]
@@ -300,7 +283,7 @@ def _cross_and_angle(vector: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Te
 
 
 def mean(q: Tensor) -> Tensor:
-    """Karcher mean (..., 4) of rotations: to it their squared angles add up to the least.
+    """Compute the Karcher mean (..., 4): to it squared angles add up to the least.
 
     Signs of quaternions do not matter. It is looked for from the eigenvector of
     ``sum q q^T`` to the largest eigenvalue, which decides where there are several.
@@ -326,11 +309,12 @@ def mean(q: Tensor) -> Tensor:
 
 
 def interpolate(time: Tensor, knots: Tensor, q: Tensor) -> Tensor:
-    """Orientations (..., 4) at ``time`` (...) of a path, by slerp; before and behind its ends.
+    """Interpolate orientations (..., 4) at ``time`` (...) of a path by slerp.
 
     Parameters
     ----------
     time : Tensor of shape (...)
+        When orientations are wanted.
     knots : Tensor of shape (T,)
         Ascending times.
     q : Tensor of shape (T, 4)
@@ -372,13 +356,13 @@ def rotate(q: Tensor, vector: Tensor) -> Tensor:
 
 
 def to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions ``q``."""
+    """Compute rotation matrices (..., 3, 3) of unit quaternions ``q``."""
     pairs = (q[..., :, None] * q[..., None, :]).flatten(-2)
     return (pairs @ _constant("rotation", q)).unflatten(-1, (3, 3))
 
 
 def from_matrix(matrix: Tensor) -> Tensor:
-    """Unit quaternions of rotation matrices, real part non-negative.
+    """Compute unit quaternions of rotation matrices, real part non-negative.
 
     Of the four textbook formulas the one with the largest divisor is taken, so the result
     is exact to rounding at every angle, half turns included.

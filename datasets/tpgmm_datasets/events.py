@@ -261,7 +261,7 @@ class Stop(Detector):
             raise DataError(f"a stop of link {self.link!r} needs the robot")
         if self.link not in robot.links:
             raise UnknownNameError("link", self.link, "the robot", robot.links)
-        state = robot.state(demonstration.reordered(robot.joint_names).joints)
+        state = robot.state(demonstration.reorder(robot.joint_names).joints)
         position = as_array(state.position(self.link))
         speed = smooth_speed(position, time, SMOOTHING)
         peak = float(np.quantile(speed, 0.98))

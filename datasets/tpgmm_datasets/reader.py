@@ -43,7 +43,7 @@ __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 
 #: What helps where values in a unit of their own are out of range.
 RAW = (
-    "They are 'raw', and robot.unlimited([...]) has no limits for them; or units='lerobot', "
+    "They are 'raw', and robot.drop_limits([...]) has no limits for them; or units='lerobot', "
     "where a gripper's 0 to 100 are its limits"
 )
 
@@ -127,7 +127,7 @@ class Recording:
         robot, raw = self.assembly.robot, self.assembly.joints.raw
         if not raw or not isinstance(robot, Robot):
             return self
-        return replace(self, assembly=replace(self.assembly, robot=robot.unlimited(raw)))
+        return replace(self, assembly=replace(self.assembly, robot=robot.drop_limits(raw)))
 
     def _report(self, summaries: Sequence[RecordingSummary]) -> Report:
         """Report findings and doubtful events."""

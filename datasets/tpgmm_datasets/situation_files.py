@@ -85,7 +85,7 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
         for name in joints:
             if name not in joint_names:
                 raise UnknownNameError("joint", name, "the model", joint_names)
-    situation = Situation(joints, poses, **times).reordered(joint_names)
+    situation = Situation(joints, poses, **times).reorder(joint_names)
     if len(situation.joints) != len(joint_names):
         wanted = f"the model has {len(joint_names)} joints: {list(joint_names)}"
         raise ShapeError(f"'joints' has {len(situation.joints)} values, {wanted}")

@@ -435,8 +435,8 @@ class _Writer:
         if (shown.joint_names is None) != (first is None):
             raise DatasetError(f"demonstration {number} has joint_names unlike the others")
         if first is not None:
-            shown = shown.reordered(first)
-            commanded = commanded and commanded.reordered(first)
+            shown = shown.reorder(first)
+            commanded = commanded and commanded.reorder(first)
         columns = demonstration_columns(shown, number, features, self.info["fps"])
         if commanded is not None:
             columns |= action_column(commanded, number, features)

@@ -21,7 +21,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.structure.choices import operators_or_default
 
 __all__ = ["adopt", "check_dataset", "read_declared"]

@@ -164,7 +164,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             self._model = self._apply_overrides(model)
         self.joints = self._match_joints(cell, dataset_meta)
         if dataset_meta is not None and isinstance(self.kinematics, Robot):
-            self.kinematics = self.kinematics.unlimited(self.joints.raw)
+            self.kinematics = self.kinematics.drop_limits(self.joints.raw)
         summary = None if model is None else _skill(model).summary
         names = select_observed(config, required, summary)
         self.frames = self._locate_frames(names, config.frames)

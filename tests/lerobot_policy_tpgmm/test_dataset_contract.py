@@ -18,7 +18,7 @@ from tpgmm_datasets.robots import parse_robot, upper_body_urdf
 from tpgmm_datasets.units import Scale
 from tpgmm_torch import Canonical, Robot
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 NAMES = fitted().kinematics.joint_names
 POSE = [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]

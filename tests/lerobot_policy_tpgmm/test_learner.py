@@ -29,7 +29,7 @@ from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import encode
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
 

@@ -101,7 +101,7 @@ def test_the_cup_is_grasped_where_it_was_not_shown(made, monkeypatch):
     output("reproduce", "out/policy", "--situations", "new.json", "--out", "out/new.csv")
     [motion] = demonstrations_from_frame(read_table("out/new.csv"))
     step = int((motion.time - (AT + HALF / 2)).abs().argmin())
-    assert misses(motion.reordered(robot.joint_names).joints[step]) < 1e-3
+    assert misses(motion.reorder(robot.joint_names).joints[step]) < 1e-3
 
 
 def test_the_robot_that_lerobot_moves_grasps_it_too(made):

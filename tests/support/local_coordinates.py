@@ -18,7 +18,7 @@ def local_coordinates(
     holds: Sequence[Hold] = (),
 ) -> Tensor:
     """The data set X^(j) (T, D); objects that were held are where they were last free."""
-    demonstration = demonstration.reordered(kinematics.joint_names)
+    demonstration = demonstration.reorder(kinematics.joint_names)
     state = kinematics.state(demonstration.joints)
     time = demonstration.time.to(state.joints)
     frames = {name: frame.to(state.joints) for name, frame in demonstration.frames.items()}

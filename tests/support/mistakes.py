@@ -1083,7 +1083,7 @@ def grippers_beyond_their_hundred(folder):
     load_arms(folder, joints(1.6, 5), units="lerobot")
 
 
-@mistake("units", r"units: .*cannot be: 'left_gripper' .*'raw'.*unlimited.*'lerobot'")
+@mistake("units", r"units: .*cannot be: 'left_gripper' .*'raw'.*drop_limits.*'lerobot'")
 def raw_grippers_of_a_robot_with_limits(folder):
     load_arms(folder, units={"*": "deg", "*gripper": "raw"})
 

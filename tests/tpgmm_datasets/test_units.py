@@ -123,7 +123,7 @@ def test_lerobots_units_are_degrees_and_a_grippers_range():
             assert reached == pytest.approx(ends) and scale.stored == (0, 100)
         else:
             assert unit == "deg"
-    free = robot.unlimited(["left_gripper", "right_gripper"])
+    free = robot.drop_limits(["left_gripper", "right_gripper"])
     for other in (None, free, parse_robot("so101")):  # no limits of that joint are known
         told = units_of("lerobot", stored, robot.joint_names, other, "")
         assert told == ["raw" if "gripper" in name else "deg" for name in stored]

@@ -60,7 +60,7 @@ def test_identity_over_lengths_names_and_rates(
 
 def test_actions_are_the_references_that_were_given(tmp_path):
     first = demonstration(0)
-    second = demonstration(1).reordered(["joint_2", "joint_0", "joint_1"])
+    second = demonstration(1).reorder(["joint_2", "joint_0", "joint_1"])
     references = [motion.joints + 0.5 for motion in (first, second)]
     root = save_lerobot(
         [first, second], tmp_path / "set", fps=FPS, task="reach", actions=references
@@ -68,7 +68,7 @@ def test_actions_are_the_references_that_were_given(tmp_path):
     for key, shift in (("observation.state", 0.0), ("action", 0.5)):
         found = load_lerobot(root, joints=key)
         for read, written in zip(found, (first, second), strict=True):
-            expected = written.reordered(read.joint_names).joints + shift
+            expected = written.reorder(read.joint_names).joints + shift
             torch.testing.assert_close(read.joints, expected, rtol=0, atol=1e-6)
 
 

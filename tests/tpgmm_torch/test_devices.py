@@ -17,19 +17,19 @@ DEVICES = [
 ]
 
 
-def learned(device: str) -> TaskParameterizedGMM:
+def learn_on(device: str) -> TaskParameterizedGMM:
     # beyond convergence rounding decides how covariances are regularised: EM stops before
     return bottle_model(8, device=device).fit(few_bottles())
 
 
 @pytest.fixture(scope="module")
 def reference() -> TaskParameterizedGMM:
-    return learned("cpu")
+    return learn_on("cpu")
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_learning_and_reproducing_are_the_same_on_each_device(device, reference, tmp_path):
-    model = learned(device)
+    model = learn_on(device)
     for one, other in zip(learned_tensors(model), learned_tensors(reference), strict=True):
         assert one.device.type == device
         torch.testing.assert_close(one.cpu(), other, rtol=1e-6, atol=1e-8)
@@ -47,7 +47,7 @@ def test_learning_and_reproducing_are_the_same_on_each_device(device, reference,
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_controllers_and_bounded_references_run_on_each_device(device, reference):
-    model, shown = learned(device), few_bottles()[1]
+    model, shown = learn_on(device), few_bottles()[1]
     situation = Situation.of(shown)
     [bounded] = rollout(model.skill, [situation], bounds="robot", blend=1.0)
     [expected] = rollout(reference.skill, [situation], bounds="robot", blend=1.0)
@@ -62,7 +62,7 @@ def test_controllers_and_bounded_references_run_on_each_device(device, reference
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_a_batch_of_robots_steps_on_each_device(device, reference):
-    model, shown = learned(device), few_bottles()[0]
+    model, shown = learn_on(device), few_bottles()[0]
     rng = np.random.default_rng(0)
     starts = torch.from_numpy(rng.normal(shown.joints[0].cpu(), 0.05, (600, 17)))
     time = torch.from_numpy(rng.uniform(0.0, float(shown.time[-1]), 600))

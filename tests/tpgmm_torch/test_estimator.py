@@ -74,7 +74,7 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.training.hold_detection import with_holds
 from tpgmm_torch.training.local_data import local_data
 
@@ -420,7 +420,7 @@ def test_a_demonstration_s_own_time_is_not_taken_along():
     assert torch.equal(found.time, hands().time_)
     assert torch.equal(found.joints, same.joints)
     # the cup moves when it did, and stands still where no more is known
-    cup = cut.frames["cup"].resampled(cut.time, hands().time_)
+    cup = cut.frames["cup"].resample(cut.time, hands().time_)
     [expected] = hands().predict(Situation(cut.joints[0], {"cup": cup}, hands().time_))
     torch.testing.assert_close(found.joints, expected.joints, rtol=0, atol=1e-12)
 

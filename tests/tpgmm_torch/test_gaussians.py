@@ -88,7 +88,7 @@ def test_product_does_not_depend_on_the_order_of_its_factors(seed, size, order):
 # The information form
 
 
-def summed(terms: list[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def add_up(terms: list[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     precision = torch.stack([term[0] for term in terms]).sum(0)
     vector = torch.stack([term[1] for term in terms]).sum(0)
     return gaussians.from_information(precision, vector[..., 0])
@@ -109,7 +109,7 @@ def test_both_forms_agree_where_every_jacobian_is_invertible(seed, size, n_facto
         gaussians.information(j, y[:, None], s)
         for j, y, s in zip(jacobians, targets, covariances, strict=True)
     ]
-    for left, right in zip(summed(terms), product, strict=True):
+    for left, right in zip(add_up(terms), product, strict=True):
         assert_close(left, right, 1e-9)
 
 
@@ -295,7 +295,7 @@ def test_sums_of_information_are_the_product_of_pseudo_inverses():
     singular = np.linalg.pinv(inverse @ covariance.numpy() @ inverse.T, rcond=1e-9)
     full = np.linalg.inv(identity_covariance.numpy())
     expected = np.linalg.inv(full + singular)
-    mean, spread = summed(terms)
+    mean, spread = add_up(terms)
     assert_close(spread, expected)
     weighted = full @ identity_target.numpy() + singular @ inverse @ target.numpy()
     assert_close(mean, expected @ weighted)

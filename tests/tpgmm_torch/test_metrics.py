@@ -73,7 +73,7 @@ def test_the_scorer_is_minus_the_mean_error():
         reproduction_scorer(hands(), [])
 
 
-def flipped(demonstration: Demonstration, steps: slice = slice(None)) -> Demonstration:
+def flip_signs(demonstration: Demonstration, steps: slice = slice(None)) -> Demonstration:
     """The same poses with the other sign of their quaternions, at some steps."""
     joints = demonstration.joints.clone()
     joints[steps] = OnPoses().flipped_answer(joints[steps])
@@ -83,17 +83,17 @@ def flipped(demonstration: Demonstration, steps: slice = slice(None)) -> Demonst
 def test_signs_of_recorded_quaternions_mean_nothing():
     [shown] = handlings(1)
     found = trajectory(shown.time, shown.joints, HANDS.joint_names)
-    for other in (flipped(shown), flipped(shown, slice(3, None, 4))):
+    for other in (flip_signs(shown), flip_signs(shown, slice(3, None, 4))):
         assert joint_rmse(found, other) == 0.0
         assert pose_errors(found, other, HANDS, "left").angle.max() < 1e-5
         for scorer in (reproduction_scorer, PoseScorer(), PoseScorer(quantity="angle")):
             assert scorer(hands(), [other]) == pytest.approx(scorer(hands(), [shown]), rel=1e-9)
-    moved = flipped(shown).joints.clone()
+    moved = flip_signs(shown).joints.clone()
     moved[:, 0] += 0.7
     assert joint_rmse(found, replace(shown, joints=moved)) == pytest.approx(0.7 / 14**0.5)
 
 
-def shifted(shown: Demonstration, turn: Rotation, by: float) -> Trajectory:
+def shift_hand(shown: Demonstration, turn: Rotation, by: float) -> Trajectory:
     """The right hand elsewhere by so many metres, and turned."""
     joints = shown.joints.clone()
     joints[:, 8] += by
@@ -105,7 +105,7 @@ def shifted(shown: Demonstration, turn: Rotation, by: float) -> Trajectory:
 
 def test_pose_errors_are_distances_and_angles():
     [shown] = handlings(1)
-    found = shifted(shown, Rotation.from_rotvec([0.0, 0.0, 30.0], degrees=True), 0.004)
+    found = shift_hand(shown, Rotation.from_rotvec([0.0, 0.0, 30.0], degrees=True), 0.004)
     errors = pose_errors(found, shown, HANDS, "right")
     assert torch.equal(errors.time, shown.time)
     torch.testing.assert_close(errors.position, torch.full((30,), 4.0).double())

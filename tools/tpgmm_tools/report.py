@@ -108,7 +108,7 @@ def leave_one_out(
                 error = pose_errors(trajectory, shown, fitted.kinematics_, link, time)
                 errors[link, event] = float(error.position), float(error.angle)
         novelty = np.nan if trajectory.novelty is None else float(trajectory.novelty)
-        path = joint_rmse(trajectory, shown.reordered(fitted.kinematics_.joint_names))
+        path = joint_rmse(trajectory, shown.reorder(fitted.kinematics_.joint_names))
         found.append(LeftOut(index, novelty, errors, path))
         if progress is not None:
             progress(done + 1, len(chosen))

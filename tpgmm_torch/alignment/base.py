@@ -51,18 +51,13 @@ def retime(
         Quaternions are interpolated by slerp, everything else linearly; constant frames are
         the same. Holds stay with the motion; an event after the end of the path is left out.
     """
-    own, joints = as_array(demonstration.time), demonstration.joints
-    steps = np.arange(len(own))
-    at = np.interp(path, own, steps)
+    recorded, joints = as_array(demonstration.time), demonstration.joints
+    steps = np.arange(len(recorded))
+    at = np.interp(path, recorded, steps)
     place = torch.from_numpy(at)
     lower = place.floor().long().clamp(0, len(demonstration) - 2)
     fraction = place - lower
-    start, end = joints[lower.to(joints.device)], joints[lower.to(joints.device) + 1]
-    weight = fraction.to(joints)
-    moved = torch.lerp(start, end, weight[:, None])
-    for block in map(list, quaternion_blocks):
-        before, after = (quaternions.normalize(values[:, block]) for values in (start, end))
-        moved[:, block] = quaternions.slerp(before, after, weight)
+    moved = _interpolate_joints(joints, lower, fraction, quaternion_blocks)
     frames = {
         name: frame.between(lower, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
@@ -70,17 +65,17 @@ def retime(
     grid = as_array(time)
 
     def clock(instant: float) -> float:
-        return float(np.interp(np.interp(instant, own, steps), at, grid))
+        return float(np.interp(np.interp(instant, recorded, steps), at, grid))
 
     end_of_path = at[-1] + 1e-9
     events = {
         name: clock(instant)
         for name, instant in demonstration.events.items()
-        if np.interp(instant, own, steps) <= end_of_path
+        if np.interp(instant, recorded, steps) <= end_of_path
     }
     holds = demonstration.holds
     if holds is not None:  # those outside the path shrink to an instant, and are left out
-        holds = tuple(h.retimed(clock) for h in holds if clock(h.begin) < clock(h.end))
+        holds = tuple(h.retime(clock) for h in holds if clock(h.begin) < clock(h.end))
     time = time.to(demonstration.time)
     names = demonstration.joint_names
     wrenches = {
@@ -88,6 +83,19 @@ def retime(
         for link, wrench in demonstration.wrenches.items()
     }
     return Demonstration(time, moved, frames, names, events, holds, wrenches)
+
+
+def _interpolate_joints(
+    joints: Tensor, lower: Tensor, fraction: Tensor, quaternion_blocks: Sequence[Sequence[int]]
+) -> Tensor:
+    """Interpolate between time steps and the next ones, quaternions by slerp."""
+    lower, weight = lower.to(joints.device), fraction.to(joints)
+    start, end = joints[lower], joints[lower + 1]
+    moved = torch.lerp(start, end, weight[:, None])
+    for block in map(list, quaternion_blocks):
+        before, after = (quaternions.normalize(values[:, block]) for values in (start, end))
+        moved[:, block] = quaternions.slerp(before, after, weight)
+    return moved
 
 
 class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
@@ -114,7 +122,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         """Fit, and align the same demonstrations without warping them again."""
         X = check_demonstrations(X)
         self.fit(X, y)
-        return list(map(self._retimed, self._checked(X), self.paths_))
+        return list(map(self._retime, self._check(X), self.paths_))
 
     def transform(self, X: Sequence[Any]) -> list[Any]:
         """Align demonstrations onto the time grid learned by ``fit``.
@@ -140,7 +148,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         self._check_fitted("time_")
         if isinstance(X, Sequence) and X and all(isinstance(item, Situation) for item in X):
             return list(X)
-        return [self._retimed(one, self._path(one)) for one in self._checked(X)]
+        return [self._retime(one, self._path(one)) for one in self._check(X)]
 
     @abc.abstractmethod
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
@@ -148,7 +156,7 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
 
     @abc.abstractmethod
     def _path(self, demonstration: Demonstration) -> Array:
-        """Instants of a demonstration at each time of the grid [s]."""
+        """Compute instants of a demonstration at each time of the grid [s]."""
 
     def _start(self, X: Any) -> list[Demonstration]:
         """Check parameters and demonstrations, as each ``fit`` does first."""
@@ -156,9 +164,9 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
         check_robot(self.robot)
         demonstrations = check_demonstrations(X)
         self.joint_names_ = demonstrations[0].joint_names
-        return self._checked(demonstrations)
+        return self._check(demonstrations)
 
-    def _checked(self, X: Any) -> list[Demonstration]:
+    def _check(self, X: Any) -> list[Demonstration]:
         """Check demonstrations and bring their joints into the order of the first fitted."""
         demonstrations = check_demonstrations(X)
         for index, one in enumerate(demonstrations):
@@ -167,8 +175,8 @@ class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
                     f"demonstration {index} has one time step: there is nothing to align"
                 )
         names = self.joint_names_
-        return demonstrations if names is None else [d.reordered(names) for d in demonstrations]
+        return demonstrations if names is None else [d.reorder(names) for d in demonstrations]
 
-    def _retimed(self, demonstration: Demonstration, path: Array) -> Demonstration:
+    def _retime(self, demonstration: Demonstration, path: Array) -> Demonstration:
         blocks = quaternion_columns(demonstration, self.robot)
         return retime(demonstration, path, self.time_, blocks)

@@ -198,16 +198,16 @@ class DynamicTimeWarping(Alignment):
         self._target = resample(average, elapsed, self._clock)
 
     def _linear(self, demonstration: Demonstration) -> Array:
-        """Instants of a demonstration, as many as the reference has, evenly [s]."""
+        """Space as many instants of a demonstration as the reference has, evenly [s]."""
         time = as_array(demonstration.time)
         return np.linspace(time[0], time[-1], len(self._clock))
 
     def _uniform(self, demonstration: Demonstration, sequence: Array) -> Array:
-        """Features of a demonstration at those instants."""
+        """Compute features of a demonstration at those instants."""
         return resample(sequence, as_array(demonstration.time), self._linear(demonstration))
 
     def _warp(self, demonstration: Demonstration, sequence: Array) -> Array:
-        """The instants of a demonstration that belong to those of the reference's clock."""
+        """Match the instants of a demonstration with those of the reference's clock."""
         source = self._uniform(demonstration, sequence)
         path, _ = warping_path(self._target, source, self.penalty, self.max_slope)
         step = (self._clock[-1] - self._clock[0]) / (len(self._clock) - 1)
@@ -216,7 +216,7 @@ class DynamicTimeWarping(Alignment):
         return instants
 
     def _reason_against(self, demonstration: Demonstration, warp: Array) -> str:
-        """Why a demonstration should rather run linearly; empty if it should not."""
+        """Tell why a demonstration should rather run linearly; empty if it should not."""
         linear = self._linear(demonstration)
         tolerance = NEARLY_LINEAR * demonstration.duration
         if (
@@ -225,11 +225,11 @@ class DynamicTimeWarping(Alignment):
             or np.abs(warp - linear).max() <= tolerance
         ):
             return ""
-        own, time = self._held_out(demonstration), as_array(demonstration.time)
+        features, time = self._held_out(demonstration), as_array(demonstration.time)
         before, after = (
             # over both clocks: a part squeezed into an instant counts with its duration
             np.average(
-                ((resample(own, time, w) - self._held_out_target) ** 2).sum(axis=1),
+                ((resample(features, time, w) - self._held_out_target) ** 2).sum(axis=1),
                 weights=1 + np.gradient(w) / np.gradient(w).mean(),
             )
             for w in (linear, warp)
@@ -242,7 +242,7 @@ class DynamicTimeWarping(Alignment):
         )
 
     def _on_grid(self, demonstration: Demonstration, warp: Array, reason: str) -> Array:
-        """Instants at the times of the grid, linear where there is a reason against warping."""
+        """Compute instants on the grid, linear where there is a reason against warping."""
         chosen = self._linear(demonstration) if reason else warp
         instants: Array = np.interp(self.time_.numpy(), self._clock, chosen)
         return instants

@@ -26,7 +26,7 @@ WEIGHTS = {"speed": 5.0, "directions": 4.5}
 
 
 def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[int]]:
-    """Columns of the joints that hold unit quaternions, as those of recorded poses do.
+    """Locate unit quaternions among the joints, as those of recorded poses.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[in
             f"the demonstration has {demonstration.n_joints} joints without names, the "
             f"robot has {robot.n_joints}: {robot.joint_names}"
         )
-    demonstration.reordered(robot.joint_names)  # names a joint that is missing
+    demonstration.reorder(robot.joint_names)  # names a joint that is missing
     names = list(demonstration.joint_names or robot.joint_names)
     columns = [names.index(name) for name in robot.joint_names]
     return [columns[start : start + 4] for start in starts]
@@ -137,7 +137,7 @@ class AlignmentFeatures:
         return tuple(self.columns)
 
     def others(self, demonstrations: Sequence[Demonstration]) -> Self | None:
-        """The groups that are not in use, seen from frames left aside; None if none changes.
+        """Fit the groups that are not in use, seen from no frame; None if none changes.
 
         Whether a matching by some features is right shows in others.
         """
@@ -149,7 +149,7 @@ class AlignmentFeatures:
             return None
 
     def __call__(self, demonstration: Demonstration) -> Array:
-        """The features of a demonstration, shape (T, D)."""
+        """Compute the features of a demonstration, shape (T, D)."""
         groups = _groups(demonstration, self.robot)
         for name in self.names:
             if name not in groups:
@@ -161,7 +161,7 @@ class AlignmentFeatures:
 
 
 def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
-    """All feature groups of a demonstration, unscaled, each of shape (T, d)."""
+    """Compute all feature groups of a demonstration, unscaled, each of shape (T, d)."""
     joints = demonstration.joints
     quaternion = quaternion_columns(demonstration, robot)
     others = np.setdiff1d(np.arange(demonstration.n_joints), np.ravel(quaternion))
@@ -170,15 +170,15 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     velocity = _velocity(values, demonstration)
     groups = {"joints": values, "directions": _directions(velocity)}
     if robot is None or not robot.links:
-        return groups | {"speed": _speed(velocity)}
+        return groups | {"speed": _relative_speed(velocity)}
     names = getattr(robot, "joint_names", None)
-    ordered = demonstration if names is None else demonstration.reordered(names)
+    ordered = demonstration if names is None else demonstration.reorder(names)
     state = robot.state(ordered.joints.detach())
     speeds = []
     for link in robot.links:
         position = state.position(link)
         groups[link] = as_array(position)
-        speeds.append(_speed(_velocity(groups[link], demonstration)))
+        speeds.append(_relative_speed(_velocity(groups[link], demonstration)))
         for name, frame in demonstration.frames.items():
             seen = frame.to(position).inverse_transform(position)
             groups[f"{link} in {name}"] = as_array(seen)
@@ -186,7 +186,7 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
 
 
 def _velocity(values: Array, demonstration: Demonstration) -> Array:
-    """Smoothed rates of change, zero where values are constant, shape (T, d)."""
+    """Compute smoothed rates of change, zero where values are constant, shape (T, d)."""
     time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
@@ -196,12 +196,12 @@ def _velocity(values: Array, demonstration: Demonstration) -> Array:
 
 
 def _varying(deviation: Array, size: Array) -> NDArray[np.bool_]:
-    """Whether columns vary beyond what rounding leaves of their sizes."""
+    """Check whether columns vary beyond what rounding leaves of their sizes."""
     return np.asarray(deviation > np.finfo(np.float64).eps ** 0.5 * size)
 
 
-def _speed(velocity: Array) -> Array:
-    """Speed over its root mean square, which may be zero, shape (T, 1)."""
+def _relative_speed(velocity: Array) -> Array:
+    """Divide the speed by its root mean square, which may be zero, shape (T, 1)."""
     speed = np.linalg.norm(velocity, axis=1, keepdims=True)
     usual = np.sqrt((speed**2).mean())
     return speed / usual if usual > 0 else speed

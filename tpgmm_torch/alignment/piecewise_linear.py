@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from typing import Any, Self
@@ -78,7 +78,7 @@ class LinearTimeNormalization(Alignment):
         self.time_ = torch.linspace(0, float(self._instants[-1]), n_steps, dtype=torch.float64)
 
     def _anchors(self, demonstration: Demonstration) -> Array:
-        """Beginning and end of a demonstration [s]."""
+        """Return beginning, events and end of a demonstration [s]."""
         return as_array(demonstration.time)[[0, -1]]
 
     def _path(self, demonstration: Demonstration) -> Array:
@@ -175,41 +175,36 @@ class EventAlignment(LinearTimeNormalization):
         self.instants_ = dict(zip(self.events_, self._instants[1:-1].tolist(), strict=True))
         self._fit_parts(demonstrations)
         self.paths_ = [
-            self._joined(one, [part and part.paths_[i] for part in self.parts_])
+            self._join_parts(one, [part and part.paths_[i] for part in self.parts_])
             for i, one in enumerate(demonstrations)
         ]
         return self
 
     def _order(self, demonstrations: Sequence[Demonstration]) -> tuple[str, ...]:
-        """Names of the anchors, each of which every demonstration has."""
+        """Sort the names of the anchors, each of which every demonstration has."""
         known = dict.fromkeys(name for one in demonstrations for name in one.events)
-        wanted = self._wanted([name for name in known if name not in ("start", "end")])
+        wanted = self._match_events([name for name in known if name not in ("start", "end")])
         if not wanted:
             raise DataError(
                 "there are no events to align at: find them (find_events, events=... of "
                 "load_lerobot, --event), or use LinearTimeNormalization"
             )
         for name in wanted:
-            lost = [i for i, one in enumerate(demonstrations) if name not in one.events]
-            if lost:
-                raise DataError(
-                    f"event {name!r} is missing in demonstrations {lost}; events are "
-                    f"{sorted(known)}. Leave them out, or align at others: events=[...]"
-                )
+            _check_event(name, demonstrations, known)
         if self.events is not None:
             return tuple(wanted)
         return tuple(sorted(wanted, key=lambda name: _median_phase(name, demonstrations)))
 
-    def _wanted(self, known: list[str]) -> list[str]:
-        """The events to align at: all that are known, or those asked for by name or pattern."""
+    def _match_events(self, known: list[str]) -> list[str]:
+        """Match the events to align at, asked for by name or pattern, or take all."""
         if self.events is None:
             return known
         found = {event: [n for n in known if fnmatchcase(n, event)] for event in self.events}
-        names = [name for event, own in found.items() for name in own or [event]]
+        names = [name for event, fits in found.items() for name in fits or [event]]
         return [name for name in dict.fromkeys(names) if name not in ("start", "end")]
 
     def _anchors(self, demonstration: Demonstration, which: str = "the demonstration") -> Array:
-        """Beginning, events and end of a demonstration [s]."""
+        """Return beginning, events and end of a demonstration [s]."""
         for name in self.events_:
             if name not in demonstration.events:
                 raise DataError(
@@ -247,7 +242,7 @@ class EventAlignment(LinearTimeNormalization):
     def _warping(
         self, demonstrations: Sequence[Demonstration], number: int
     ) -> DynamicTimeWarping | None:
-        """How one part is warped; None where nothing moves or there are few time steps."""
+        """Learn to warp a part; None where nothing moves or there are few time steps."""
         parts = [self._part(one, number) for one in demonstrations]
         moving = any(bool(one.joints.diff(dim=0).any()) for one in parts)
         if len(parts[0]) < SHORTEST_PART or not moving:
@@ -259,7 +254,7 @@ class EventAlignment(LinearTimeNormalization):
             return part.fit(parts)
 
     def _part(self, demonstration: Demonstration, number: int) -> Demonstration:
-        """The part behind anchor ``number``, evenly stretched."""
+        """Cut out the part behind anchor ``number``, evenly stretched."""
         begin, end = self._instants[number : number + 2]
         step = float(self._instants[-1]) / (len(self.time_) - 1)
         n_steps = max(round((end - begin) / step), 1) + 1
@@ -276,10 +271,10 @@ class EventAlignment(LinearTimeNormalization):
             None if part is None else part._path(self._part(demonstration, number))
             for number, part in enumerate(self.parts_)
         ]
-        return self._joined(demonstration, paths)
+        return self._join_parts(demonstration, paths)
 
-    def _joined(self, demonstration: Demonstration, paths: Sequence[Array | None]) -> Array:
-        """Instants of the demonstration: warped in parts by ``paths``, stretched elsewhere."""
+    def _join_parts(self, demonstration: Demonstration, paths: Sequence[Array | None]) -> Array:
+        """Join parts: warped by ``paths``, stretched elsewhere."""
         grid = self.time_.numpy()
         evenly = grid.copy()
         for (begin, end), path in zip(pairwise(self._instants), paths, strict=True):
@@ -291,7 +286,19 @@ class EventAlignment(LinearTimeNormalization):
         return instants
 
 
+def _check_event(
+    name: str, demonstrations: Sequence[Demonstration], known: Iterable[str]
+) -> None:
+    """Refuse an event that a demonstration does not have."""
+    lost = [i for i, one in enumerate(demonstrations) if name not in one.events]
+    if lost:
+        raise DataError(
+            f"event {name!r} is missing in demonstrations {lost}; events are "
+            f"{sorted(known)}. Leave them out, or align at others: events=[...]"
+        )
+
+
 def _median_phase(event: str, demonstrations: Sequence[Demonstration]) -> float:
-    """When an event happens, as a share of the duration."""
+    """Compute when an event happens, as a share of the duration."""
     phases = [(d.events[event] - d.event("start")) / d.duration for d in demonstrations]
     return float(np.median(phases))

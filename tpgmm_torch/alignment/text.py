@@ -19,7 +19,7 @@ METHODS = ("dtw", "barycenter", "linear", "events", "events+dtw", "none")
 def parse_alignment(
     method: str, robot: Any = None, features: Sequence[str] | None = None
 ) -> Alignment | None:
-    """The transformer of a name; None for ``"none"``.
+    """Make the transformer of a name; None for ``"none"``.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def moving_average(values: Array, width: int) -> Array:
 def warping_path(
     reference: Array, source: Array, penalty: float = 0.0, max_slope: int = 2
 ) -> tuple[NDArray[np.intp], float]:
-    """The cheapest monotone matching of two sequences, within bounds of its slope.
+    """Find the cheapest monotone matching of two sequences, within bounds of its slope.
 
     The path is made of segments that advance by one in one sequence and by one to
     ``max_slope`` in the other, so no part of it is steeper than ``max_slope`` or flatter than
@@ -86,7 +86,7 @@ def warping_path(
     segments = [(1, 1), *((a, b) for k in range(2, border + 1) for a, b in ((1, k), (k, 1)))]
 
     def candidates(i: int, begin: int, end: int) -> Iterator[Array]:
-        """Costs of the pairs (i, begin) to (i, end - 1), reached by each of the segments."""
+        """Yield costs of the pairs (i, begin) to (i, end - 1), reached by each segment."""
         along = across = costs[i, begin:end]
         yield totals[i - 1, begin - 1 : end - 1] + along
         for k in range(2, border + 1):
@@ -128,7 +128,7 @@ def warping_map(path: NDArray[np.intp], width: int = 0, min_slope: float = 1e-3)
 
 
 def medoid(sequences: Sequence[Array], max_slope: int = 2, n_steps: int = 200) -> int:
-    """Index of the sequence with the least summed warping distance to the others.
+    """Find the sequence with the least summed warping distance to the others.
 
     Parameters
     ----------
@@ -185,10 +185,10 @@ def barycenter(
     for _ in range(max_iter):
         total, counts, cost = np.zeros_like(start), np.zeros(len(start)), 0.0
         for sequence in sequences:
-            path, one = warping_path(average, sequence, penalty, max_slope)
+            path, path_cost = warping_path(average, sequence, penalty, max_slope)
             np.add.at(total, path[:, 0], sequence[path[:, 1]])
             counts += np.bincount(path[:, 0], minlength=len(start))
-            cost += one
+            cost += path_cost
         if cost >= last * (1 - tol):
             break
         average, last = total / counts[:, None], cost

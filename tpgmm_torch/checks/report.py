@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
-__all__ = ["Finding", "Report", "in_columns", "listed"]
+__all__ = ["Finding", "Report", "in_columns", "shorten_list"]
 
 PACKAGE = str(Path(__file__).parents[1])
 
@@ -72,27 +72,27 @@ class Report:
 
     @classmethod
     def of(cls, findings: Iterable[Finding], subject: str) -> Report:
-        """The report with errors first."""
+        """Make a report with errors first."""
         return cls(tuple(sorted(findings, key=lambda f: not f.impossible)), subject)
 
     def __iter__(self) -> Iterator[Finding]:
-        """One finding after the other."""
+        """Iterate over the findings."""
         return iter(self.findings)
 
     def __len__(self) -> int:
-        """Number of findings."""
+        """Count the findings."""
         return len(self.findings)
 
     def __str__(self) -> str:
         if not self.findings:
             return f"{self.subject}: nothing implausible"
         items = "; ".join(f"({n}) {finding}" for n, finding in enumerate(self, start=1))
-        one = "one thing is" if len(self) == 1 else f"{len(self)} things are"
+        things = "one thing is" if len(self) == 1 else f"{len(self)} things are"
         worst = "impossible" if self.errors() else "implausible"
-        return f"{self.subject}: {one} {worst}: {items}"
+        return f"{self.subject}: {things} {worst}: {items}"
 
     def errors(self) -> tuple[Finding, ...]:
-        """Findings that are impossible."""
+        """Return the findings that are impossible."""
         return tuple(finding for finding in self if finding.impossible)
 
     def act(self, packages: tuple[str, ...] = ()) -> Report:
@@ -126,12 +126,12 @@ class Report:
         return self
 
 
-def listed(items: Sequence[str], most: int = 3) -> str:
-    """The first of some ``items``, ``most`` of them, and how many more there are.
+def shorten_list(items: Sequence[str], most: int = 3) -> str:
+    """Name the first of some ``items``, ``most`` of them, and how many more there are.
 
     Examples
     --------
-    >>> listed(["a", "b", "c", "d", "e"])
+    >>> shorten_list(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
     shown = ", ".join(items[:most])
@@ -140,7 +140,7 @@ def listed(items: Sequence[str], most: int = 3) -> str:
 
 
 def in_columns(lines: Sequence[Sequence[str]]) -> str:
-    """Lines of cells as text, with columns as wide as they need.
+    """Format lines of cells in columns as wide as they need.
 
     Parameters
     ----------

@@ -44,6 +44,7 @@ def check_situations(
     times : Tensor
         When references are wanted [s].
     kinematics : Kinematics
+        Whose limits count.
     learned : Tensor of shape (T,)
         The model's time grid [s].
     summaries : sequence of TrainingSummary, optional
@@ -61,7 +62,7 @@ def check_situations(
     novelty = np.min(novelties or [np.zeros(batch)], axis=0)
     unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelty)
     worst = np.unravel_index(int(unlike.argmax()), batch)
-    subject, label = _named(worst, batch)
+    subject, label = _describe_batch(worst, batch)
     joint = int(excess[worst].argmax())
     if excess[*worst, joint] > IMPOSSIBLE:
         findings.append(_unit(kinematics, joint, values[*worst, joint], label))
@@ -73,8 +74,8 @@ def check_situations(
     return Report.of(findings, subject)
 
 
-def _named(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
-    """Names of the batch, and of one of its situations."""
+def _describe_batch(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
+    """Name the batch, and one of its situations."""
     if len(batch) == 1 and batch[0] > 1:
         return f"{batch[0]} situations", f"situation {worst[0]}, "
     return "the situation", ""
@@ -91,7 +92,7 @@ def _unit(kinematics: Kinematics, joint: int, value: float, label: str) -> Findi
 
 
 def _time(times: Tensor, learned: Tensor) -> Iterator[Finding]:
-    """Times that lie before or after the skill by more than it lasts."""
+    """Find times that lie before or after the skill by more than it lasts."""
     begin, end = float(learned[0]), float(learned[-1])
     first, last = float(times.min()), float(times.max())
     if first < 2 * begin - end or last > 2 * end - begin:

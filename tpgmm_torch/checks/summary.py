@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import EpisodeSummary, PathSummary, differing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST
@@ -77,7 +77,7 @@ class Region:
         return cls(mean.tolist(), ((1 + 1 / n) * covariance).tolist())
 
     def distance(self, vectors: Array) -> Array:
-        """Mahalanobis distance of vectors (..., D), about 1 at the edge of the likely.
+        """Compute the Mahalanobis distance of vectors (..., D), about 1 at the likely edge.
 
         ``sqrt(d^2 / (D + 2 sqrt(2 D)))``: d^2 of D numbers has about the mean D, and the
         standard deviation sqrt(2 D).
@@ -147,8 +147,8 @@ class FrameSummary:
         # Journal of Guidance, Control, and Dynamics 30 (2007), eq. (12)
         mean = np.linalg.eigh(turns.T @ turns)[1][:, -1]
         rotations = _rotation_vectors(mean, turns)
-        fixed = not any(path.recorded for path in paths)
-        same = [name for name, pose in links.items() if fixed and _same(pose, first)]
+        recorded = any(path.recorded for path in paths)
+        events = {path.at for path in paths}
         return cls(
             np.min([path.low for path in paths], axis=0).tolist(),
             np.max([path.high for path in paths], axis=0).tolist(),
@@ -157,12 +157,12 @@ class FrameSummary:
             Region.of(places, "place"),
             Region.of(rotations, "turn"),
             any(path.moves for path in paths),
-            same[0] if same else None,
-            paths[0].at if len({path.at for path in paths}) == 1 else None,
+            None if recorded else next((n for n, p in links.items() if _same(p, first)), None),
+            paths[0].at if len(events) == 1 else None,
         )
 
     def rotation_vectors(self, orientations: Array) -> Array:
-        """Rotation vectors [rad] from the mean to orientations (..., 4), the shorter way."""
+        """Compute rotation vectors [rad] from the mean to orientations (..., 4)."""
         return _rotation_vectors(np.array(self.orientation), orientations)
 
 
@@ -173,7 +173,9 @@ class TrainingSummary:
     Parameters
     ----------
     n_demonstrations : int
+        How many were learned from, at least 1.
     joint_names : tuple of str
+        In the order of the model.
     start_low, start_high : sequence of float
         Range of the start postures [rad or m].
     compared : sequence of int
@@ -184,6 +186,7 @@ class TrainingSummary:
         The largest distance of a demonstration from the others, within 0.5 and 2: the unit of
         novelty.
     frames : mapping of str to FrameSummary
+        Poses by the names of the frames.
     events : mapping of str to float
         Median times of events that all demonstrations have, as shares of the duration.
     postures : sequence of sequence of float
@@ -210,20 +213,20 @@ class TrainingSummary:
 
     def __post_init__(self) -> None:
         n, count = len(self.joint_names), self.n_demonstrations
-        compared = [j for j in self.compared if type(j) is int and 0 <= j < n]
+        compared = _count_indices(self.compared, n)
         _check_numbers(
             self,
             n_demonstrations=(),
             limit=(),
             start_low=(n,),
             start_high=(n,),
-            compared=(len({*compared}),),
+            compared=(compared,),
             postures=(len(self.postures), n) if self.postures else (0,),
         )
         if type(count) is not int or count < 1 or self.limit <= 0:
             raise DataError(f"there are {count} demonstrations, and the limit is {self.limit}")
-        if len(self.start.mean) != len(compared):
-            raise DataError(f"{len(self.start.mean)} joints are compared, not {len(compared)}")
+        if len(self.start.mean) != compared:
+            raise DataError(f"{len(self.start.mean)} joints are compared, not {compared}")
         if not all(0 <= at <= 1 for at in self.events.values()):
             raise DataError(f"events are shares of the duration, got {self.events}")
 
@@ -236,22 +239,18 @@ class TrainingSummary:
         episodes : sequence of EpisodeSummary
             With their joints in the order of the kinematics.
         kinematics : Kinematics
+            Of the model.
         """
         starts = np.stack([episode.start for episode in episodes])
         state = kinematics.state(starts)
         links = {link: state.pose(link) for link in kinematics.links}
-        turns = [
-            *(range(first, first + 4) for first in kinematics.quaternion_starts),
-            *quaternion_groups(kinematics.joint_names),
-        ]
-        compared = np.setdiff1d(range(kinematics.n_joints), np.ravel(turns)).tolist()
+        compared = _compared_joints(kinematics)
         vectors, frames = [("start", starts[:, compared])], dict[str, FrameSummary]()
         for name in episodes[0].frames:
             paths = [episode.frames[name] for episode in episodes]
             first, frames[name] = _first_poses(paths), FrameSummary.of(paths, links)
             rotations = frames[name].rotation_vectors(as_array(first.orientation))
             vectors += [("place", as_array(first.position)), ("turn", rotations)]
-        common = set.intersection(*(set(episode.events) for episode in episodes))
         return cls(
             len(episodes),
             tuple(kinematics.joint_names),
@@ -261,15 +260,12 @@ class TrainingSummary:
             Region.of(starts[:, compared], "start"),
             _largest_distance(vectors),
             frames,
-            {
-                name: float(np.median([episode.events[name] for episode in episodes]))
-                for name in sorted(common, key=list(episodes[0].events).index)
-            },
+            _median_events(episodes),
             differing(np.concatenate([one.postures for one in episodes])).round(4).tolist(),
         )
 
     def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
-        """Distance of situations from the demonstrations, in units of the furthest of these.
+        """Measure the distance from the demonstrations, in units of the furthest of these.
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
         each frame's orientation from their regions, there where the skill begins, divided by
@@ -291,18 +287,19 @@ class TrainingSummary:
         array of shape (...)
             From 0 on.
         """
-        return _joined(self._distances(joints, frames or {}).values()) / self.limit
+        return _norm(self._distances(joints, frames or {}).values()) / self.limit
 
     def start_frames(
         self, joints: Any, kinematics: Kinematics, given: Collection[str] = ()
     ) -> dict[str, Frame]:
-        """The frames that follow from a start posture: the poses of links at the start.
+        """Compute the frames that follow from a start posture: poses of links.
 
         Parameters
         ----------
         joints : array-like of shape (..., n_joints)
             Start postures.
         kinematics : Kinematics
+            Of the model.
         given : collection of str
             Frames that are known.
 
@@ -342,7 +339,7 @@ class TrainingSummary:
         """
         distances = self._distances(joints, frames)
         ratios = {key: float(value) / self.limit for key, value in distances.items()}
-        if not _joined(distances.values()) > UNLIKELY * self.limit:
+        if not _norm(distances.values()) > UNLIKELY * self.limit:
             return []
         least = min(UNLIKELY, max(ratios.values()))
         describe = {"start": self._start, "place": self._place, "turn": self._turn}
@@ -356,12 +353,12 @@ class TrainingSummary:
         return found
 
     def config(self) -> dict[str, Any]:
-        """All of it, ready for JSON."""
+        """Describe all of it, ready for JSON."""
         return asdict(self) | {"joint_names": list(self.joint_names)}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], kinematics: Kinematics) -> Self:
-        """The inverse of :meth:`config`, for a model of these kinematics.
+        """Invert :meth:`config`, for a model of these kinematics.
 
         Raises
         ------
@@ -391,7 +388,7 @@ class TrainingSummary:
     def _distances(
         self, joints: Any, frames: Mapping[str, Frame]
     ) -> dict[tuple[str, str], Array]:
-        """Distances (...) of situations from each region, by its kind and frame."""
+        """Compute distances (...) of situations from each region, by its kind and frame."""
         found: dict[tuple[str, str], Array] = {}
         if joints is not None and len(self.compared):
             found["start", ""] = self.start.distance(_rows(joints)[..., list(self.compared)])
@@ -437,14 +434,32 @@ class TrainingSummary:
         return f"{name}: turned by {degrees}{np.rad2deg(known.angle):.0f}", remedy, ()
 
 
+def _compared_joints(kinematics: Kinematics) -> list[int]:
+    """List the columns of the joints that are no parts of a quaternion."""
+    turns = [
+        *(range(first, first + 4) for first in kinematics.quaternion_starts),
+        *quaternion_groups(kinematics.joint_names),
+    ]
+    return np.setdiff1d(range(kinematics.n_joints), np.ravel(turns)).tolist()
+
+
+def _median_events(episodes: Sequence[EpisodeSummary]) -> dict[str, float]:
+    """Compute median times of the events that all demonstrations have."""
+    return {
+        name: float(np.median([episode.events[name] for episode in episodes]))
+        for name in episodes[0].events
+        if all(name in episode.events for episode in episodes)
+    }
+
+
 def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
-    """The largest distance of a demonstration from the regions of the others."""
+    """Compute the largest distance of a demonstration from the regions of the others."""
     n = len(vectors[0][1])
     if n <= FEWEST:
         return 1.0
     tried = np.unique(np.linspace(0, n - 1, min(n, MOST_LEFT_OUT)).round().astype(int))
     distances = [
-        _joined(
+        _norm(
             Region.of(np.delete(given, i, axis=0), kind, FEWEST).distance(given[i])
             for kind, given in vectors
             if given.shape[1]
@@ -454,8 +469,8 @@ def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
     return float(np.clip(max(distances), *LIMITS))
 
 
-def _joined(distances: Iterable[Array]) -> Array:
-    """The 4-norm of distances that broadcast; NaN does not count.
+def _norm(distances: Iterable[Array]) -> Array:
+    """Compute the 4-norm of distances that broadcast; NaN does not count.
 
     It is nearly the largest, and more where several are large.
     """
@@ -471,7 +486,7 @@ def _rows(joints: Any) -> Array:
 
 
 def _same(pose: Frame, other: Frame) -> bool:
-    """Whether poses (N,) are equal up to rounding."""
+    """Check whether poses (N,) are equal up to rounding."""
     other = other.to(pose.position)
     turn = quaternions.match_hemisphere(other.orientation, pose.orientation)
     differences = as_array(pose.position - other.position), as_array(pose.orientation - turn)
@@ -482,16 +497,16 @@ def _same(pose: Frame, other: Frame) -> bool:
 def _outside(
     names: Sequence[str], low: Array, high: Array, values: Array
 ) -> tuple[str, tuple[str, ...]]:
-    """Description and names of the coordinates that are outside a range, the furthest first."""
+    """Describe and name the coordinates that are outside a range, the furthest first."""
     excess = np.maximum(low - values, values - high)
     odd = [i for i in np.argsort(-excess) if excess[i] > 0]
     places = [f"{names[i]} = {values[i]:.4g}, shown {low[i]:.4g} to {high[i]:.4g}" for i in odd]
     beside = f"beside those shown, at {', '.join(f'{x:.3g}' for x in values)}"
-    return listed(places) or beside, tuple(names[i] for i in odd)
+    return shorten_list(places) or beside, tuple(names[i] for i in odd)
 
 
 def _first_poses(paths: Sequence[PathSummary]) -> Frame:
-    """The first pose of a frame in each demonstration, (N,)."""
+    """Collect the first pose of a frame in each demonstration, (N,)."""
     positions = np.stack([path.position for path in paths])
     return Frame(positions, np.stack([path.orientation for path in paths]))
 
@@ -501,6 +516,11 @@ def _rotation_vectors(mean: Array, orientations: Array) -> Array:
         quaternions.conjugate(torch.from_numpy(mean)), torch.from_numpy(np.array(orientations))
     )
     return as_array(quaternions.log(turns))
+
+
+def _count_indices(values: Iterable[Any], n: int) -> int:
+    """Count the different integers from 0 to n - 1 among values."""
+    return sum(type(value) is int and 0 <= value < n for value in {*values})
 
 
 def _check_numbers(thing: Any, **shapes: tuple[int, ...]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import LEVER, STILL, Frame
@@ -93,6 +93,7 @@ class EpisodeSummary:
     begin, duration, step : float
         When it begins, its length, and its median step of time [s].
     joint_names : tuple of str or None
+        As of the demonstration.
     start, low, high : array of shape (n_joints,)
         Start posture, and range of each joint.
     frames : mapping of str to PathSummary
@@ -135,7 +136,7 @@ class EpisodeSummary:
 
 
 def differing(postures: Array) -> Array:
-    """At most ``POSTURES`` postures, each as far as can be from those before it.
+    """Select at most ``POSTURES`` postures, each as far as can be from those before it.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def differing(postures: Array) -> Array:
 def summarize(
     demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
 ) -> list[EpisodeSummary]:
-    """Summaries of demonstrations, with the joints in the order of the kinematics.
+    """Summarise demonstrations, with the joints in the order of the kinematics.
 
     Raises
     ------
@@ -169,7 +170,7 @@ def summarize(
 def in_order(
     demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
 ) -> list[Demonstration]:
-    """Demonstrations with the joints of the kinematics, in its order.
+    """Bring the joints of demonstrations into the order of the kinematics.
 
     Raises
     ------
@@ -184,7 +185,7 @@ def in_order(
             raise ShapeError(
                 f"demonstration {index} has {one.n_joints} joints, the robot has {n}: {names}"
             )
-    return [one.reordered(names) for one in demonstrations]
+    return [one.reorder(names) for one in demonstrations]
 
 
 def check(
@@ -206,6 +207,7 @@ def check(
     episodes : sequence of EpisodeSummary
         As :func:`summarize` gives them.
     kinematics : Kinematics
+        Whose limits and links count.
     operators : sequence of Operator
         What is learned.
     holds : sequence of Hold
@@ -217,7 +219,7 @@ def check(
         *unit_findings(episodes, kinematics),
         *_clock(episodes),
         *_freedom(len(episodes), operators, kinematics, correlated),
-        *_carried(operators, kinematics, holds),
+        *_operators_without_effect(operators, kinematics, holds),
     ]
     count = len(episodes)
     return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
@@ -226,7 +228,7 @@ def check(
 def unit_findings(
     episodes: Sequence[EpisodeSummary], kinematics: Kinematics | None
 ) -> Iterator[Finding]:
-    """Joints beyond the robot's limits, frames hardly in metres, time not in seconds.
+    """Find joints beyond limits, frames hardly in metres, time not in seconds.
 
     Parameters
     ----------
@@ -255,20 +257,19 @@ def unit_findings(
 
 
 def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Iterator[Finding]:
-    """Joints beyond the limits: in another unit, in another order, or of another robot."""
-    low = np.min([episode.low for episode in episodes], axis=0)
-    high = np.max([episode.high for episode in episodes], axis=0)
+    """Find joints beyond the limits: in another unit or order, or of another robot."""
+    low, high = _joint_ranges(episodes)
     limits = np.stack((as_array(kinematics.lower), as_array(kinematics.upper)))
     allowed = BEYOND * np.minimum(limits[1] - limits[0], 1.0)
     # of the joints of the robot (rows) in the columns that were given
     excess = np.maximum(limits[0][:, None] - low, high - limits[1][:, None])
-    own, names = excess.diagonal(), kinematics.joint_names
-    impossible, unnamed = own.max(initial=0) > IMPOSSIBLE, episodes[0].joint_names is None
+    overshoot, names = excess.diagonal(), kinematics.joint_names
+    impossible, unnamed = overshoot.max(initial=0) > IMPOSSIBLE, episodes[0].joint_names is None
     least = np.full_like(allowed, IMPOSSIBLE) if impossible else allowed
-    beyond = [int(j) for j in np.argsort(-own) if own[j] > least[j]]
+    beyond = [int(j) for j in np.argsort(-overshoot) if overshoot[j] > least[j]]
     if not beyond:
         return
-    about, value = tuple(names[j] for j in beyond), float(own[beyond[0]])
+    about, value = tuple(names[j] for j in beyond), float(overshoot[beyond[0]])
     places = ranges(names, beyond, low, high, limits)
     cost = (excess - allowed[:, None]).clip(min=0)
     rows, columns = linear_sum_assignment(cost)
@@ -295,10 +296,16 @@ def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Itera
     yield Finding(check, message, remedy, about, value=value, impossible=bool(impossible))
 
 
+def _joint_ranges(episodes: Sequence[EpisodeSummary]) -> tuple[Array, Array]:
+    """Compute the least and largest value of each joint."""
+    low = np.min([episode.low for episode in episodes], axis=0)
+    return low, np.max([episode.high for episode in episodes], axis=0)
+
+
 def ranges(
     names: Sequence[str], columns: Sequence[int], low: Array, high: Array, limits: Array
 ) -> str:
-    """Ranges of some joints in words, beside their limits (2, n_joints) where there are any.
+    """Describe ranges of some joints, beside their limits (2, n_joints) where there are any.
 
     Parameters
     ----------
@@ -307,16 +314,18 @@ def ranges(
     columns : sequence of int
         Which joints to list.
     low, high : array of shape (n_joints,)
+        Range of each joint.
     limits : array of shape (2, n_joints)
+        Lower and upper of each joint; infinite where there are none.
     """
     places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
     bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]
     known = bool(np.isfinite(limits).any())
-    return listed([a + b * known for a, b in zip(places, bounds, strict=True)])
+    return shorten_list([a + b * known for a, b in zip(places, bounds, strict=True)])
 
 
 def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
-    """Demonstrations that show different things at one time.
+    """Find demonstrations that show different things at one time.
 
     Segments of the skill in its time, such as corrections, begin later than most and end
     within them; they are on the clock.
@@ -342,7 +351,7 @@ def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
 def _freedom(
     count: int, operators: Sequence[Operator], kinematics: Kinematics, correlated: bool
 ) -> Iterator[Finding]:
-    """Too few demonstrations to estimate variances and correlations."""
+    """Find too few demonstrations to estimate variances and correlations."""
     widest = max((operator.dimension(kinematics) for operator in operators), default=0)
     placed = widest > 2 and frame_names(operators, kinematics)
     remedy = "Show the skill 5 times or more, from other starts and places"
@@ -359,10 +368,10 @@ def _freedom(
         )
 
 
-def _carried(
+def _operators_without_effect(
     operators: Sequence[Operator], kinematics: Kinematics, holds: Sequence[Hold]
 ) -> Iterator[Finding]:
-    """Operators that constrain no joint: the objects they are about never move with a link."""
+    """Find operators that constrain no joint: their objects never move with a link."""
     links = {*kinematics.links}
     moved = links.union(hold.frame for hold in holds)
     inactive = [
@@ -377,7 +386,8 @@ def _carried(
         texts = [format_operator(operator) for operator in inactive]
         yield Finding(
             "holds",
-            f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
+            f"no link holds {' and '.join(names)}: {shorten_list(texts)} says nothing of the "
+            "joints",
             "Say who holds what: attach_holds(demonstrations, robot) finds it where poses of "
             "objects are recorded over time; Demonstration(..., holds=[Hold("
             f"{names[0]!r}, LINK, BEGIN, END)]) (--hold {names[0]}@LINK:BEGIN-END) gives it. "

@@ -65,6 +65,6 @@ def _check_finite(tensor: Tensor, name: str) -> None:
 
 
 def as_array(tensor: Tensor) -> Array:
-    """The values of a ``tensor``, without its gradient, as an array of float64."""
+    """Convert a ``tensor``, without its gradient, to an array of float64."""
     array: Array = tensor.detach().cpu().double().numpy()
     return array

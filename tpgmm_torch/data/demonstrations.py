@@ -29,7 +29,7 @@ FEWEST = 2
 SMOOTHING = 0.2
 
 
-def _checked_time(values: Any) -> Tensor:
+def _check_time(values: Any) -> Tensor:
     time = as_tensor(values, "time")
     if time.ndim != 1 or len(time) == 0:
         raise ShapeError(f"time has shape (T,) with T >= 1, got {tuple(time.shape)}")
@@ -43,7 +43,7 @@ def _checked_time(values: Any) -> Tensor:
     return time
 
 
-def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
+def _check_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
     """Check types and lengths; without ``length``, frames per time step share one."""
     frames = dict(frames or {})
     for name, frame in frames.items():
@@ -61,8 +61,8 @@ def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> d
     return frames
 
 
-def _checked_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
-    """Wrenches by link, each (T, 6)."""
+def _check_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Tensor]:
+    """Check wrenches by link, each (T, 6)."""
     checked = {}
     for link, values in dict(wrenches).items():
         wrench = as_tensor(values, f"the wrench of {link!r}")
@@ -75,7 +75,7 @@ def _checked_wrenches(wrenches: Mapping[str, Any], length: int) -> dict[str, Ten
     return checked
 
 
-def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
+def _check_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
     names = None if names is None else tuple(names)
     if names is not None and not len(set(names)) == len(names) == count:
         raise ShapeError(f"joint_names needs {count} different names, got {names}")
@@ -123,7 +123,7 @@ class Demonstration:
     ... )
     >>> demonstration
     Demonstration(3 steps, 0.20 s, 2 joints, frames=['cup'], events={})
-    >>> demonstration.reordered(["elbow"]).joints[:, 0].tolist()
+    >>> demonstration.reorder(["elbow"]).joints[:, 0].tolist()
     [1.0, 0.9, 0.7]
     """
 
@@ -136,14 +136,14 @@ class Demonstration:
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        time = _checked_time(self.time)
+        time = _check_time(self.time)
         joints = as_tensor(self.joints, "joints")
         if joints.ndim != 2 or len(joints) != len(time):
             raise ShapeError(
                 f"joints has shape (T, n_joints) with T = {len(time)} as in time, "
                 f"got {tuple(joints.shape)}"
             )
-        names = _checked_names(self.joint_names, joints.shape[1])
+        names = _check_names(self.joint_names, joints.shape[1])
         events = {str(name): float(at) for name, at in dict(self.events).items()}
         for name, at in events.items():
             if not time[0] <= at <= time[-1]:
@@ -151,10 +151,10 @@ class Demonstration:
                     f"event {name!r} at {at} s lies outside the demonstration, "
                     f"{time[0]:.6g} to {time[-1]:.6g} s"
                 )
-        frames = _checked_frames(self.frames, len(time))
+        frames = _check_frames(self.frames, len(time))
         holds = None if self.holds is None else check_holds(self.holds, frames)
         vars(self).update(time=time, joints=joints, frames=frames, joint_names=names)
-        wrenches = _checked_wrenches(self.wrenches, len(time))
+        wrenches = _check_wrenches(self.wrenches, len(time))
         vars(self).update(events=events, holds=holds, wrenches=wrenches)
 
     def __len__(self) -> int:
@@ -172,7 +172,7 @@ class Demonstration:
         return float(self.time[-1] - self.time[0])
 
     def frame(self, name: str) -> Frame:
-        """The frame of that name.
+        """Return the frame of that name.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class Demonstration:
         return self.frames[name]
 
     def event(self, name: str) -> float:
-        """When the event of that name is [s]; every demonstration has a start and an end.
+        """Return when an event is [s]; every demonstration has a start and an end.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Demonstration:
         return known[name]
 
     def at_steps(self, chosen: slice | Tensor) -> Demonstration:
-        """The demonstration at some of its time steps, with the events between them.
+        """Cut the demonstration to some time steps, with the events between them.
 
         Parameters
         ----------
@@ -216,8 +216,8 @@ class Demonstration:
             wrenches={link: wrench[chosen] for link, wrench in self.wrenches.items()},
         )
 
-    def reordered(self, joint_names: Sequence[str]) -> Demonstration:
-        """The same demonstration with its joint columns in the order of ``joint_names``.
+    def reorder(self, joint_names: Sequence[str]) -> Demonstration:
+        """Bring the joints into the order of ``joint_names``.
 
         Other columns are left out. Without names, the order is trusted.
 
@@ -226,10 +226,7 @@ class Demonstration:
         UnknownNameError
             If one of the names is not among the demonstration's.
         """
-        columns = _columns(joint_names, self.joint_names, "the demonstration")
-        if columns is None:
-            return self
-        return replace(self, joints=self.joints[:, columns], joint_names=tuple(joint_names))
+        return _reorder(self, joint_names, "the demonstration")
 
     def __repr__(self) -> str:
         return (
@@ -266,7 +263,7 @@ class Situation:
     Examples
     --------
     >>> situation = Situation({"elbow": 1.0, "shoulder": 0.0}, {"cup": Frame([0.4, 0.0, 0.1])})
-    >>> situation.reordered(["shoulder", "elbow"]).joints.tolist()
+    >>> situation.reorder(["shoulder", "elbow"]).joints.tolist()
     [0.0, 1.0]
     """
 
@@ -286,18 +283,18 @@ class Situation:
         if joints.ndim != 1 or not len(joints):
             shape = tuple(joints.shape)
             raise ShapeError(f"the start posture is a number for each joint, got shape {shape}")
-        names = _checked_names(names, len(joints))
+        names = _check_names(names, len(joints))
         times = {
-            name: None if value is None else _checked_time(value)
+            name: None if value is None else _check_time(value)
             for name, value in (("time", self.time), ("frames_time", self.frames_time))
         }
         recorded = times["time"] if self.frames_time is None else times["frames_time"]
-        frames = _checked_frames(self.frames, None if recorded is None else len(recorded))
+        frames = _check_frames(self.frames, None if recorded is None else len(recorded))
         vars(self).update(joints=joints, frames=frames, joint_names=names, **times)
 
     @classmethod
     def of(cls, demonstration: Demonstration, time: Any = None) -> Situation:
-        """The situation that a demonstration was made in: its start posture and its frames.
+        """Return the situation of a demonstration: its start posture and its frames.
 
         Parameters
         ----------
@@ -315,8 +312,8 @@ class Situation:
             demonstration.time,
         )
 
-    def reordered(self, joint_names: Sequence[str]) -> Situation:
-        """The same situation with its joints in the order of ``joint_names``.
+    def reorder(self, joint_names: Sequence[str]) -> Situation:
+        """Bring the joints into the order of ``joint_names``.
 
         Other joints are left out. Without names, the order is trusted.
 
@@ -325,17 +322,14 @@ class Situation:
         UnknownNameError
             If one of the names is not among the situation's.
         """
-        columns = _columns(joint_names, self.joint_names, "the situation")
-        if columns is None:
-            return self
-        return replace(self, joints=self.joints[columns], joint_names=tuple(joint_names))
+        return _reorder(self, joint_names, "the situation")
 
     def __repr__(self) -> str:
         time = "" if self.time is None else f", {len(self.time)} steps"
         return f"Situation({len(self.joints)} joints, frames={sorted(self.frames)}{time})"
 
     def frames_at(self, time: Tensor) -> dict[str, Frame]:
-        """The frames, those that move as they are at other times.
+        """Return the frames as they are at other times.
 
         Parameters
         ----------
@@ -350,28 +344,30 @@ class Situation:
         """
         recorded = self.time if self.frames_time is None else self.frames_time
         if recorded is None:
-            _checked_frames(self.frames, len(time))
+            _check_frames(self.frames, len(time))
             return dict(self.frames)
         recorded = recorded.to(time)
-        return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
+        return {name: frame.resample(recorded, time) for name, frame in self.frames.items()}
 
 
 def _values(joints: Mapping[str, Any]) -> Tensor:
-    """The numbers of joints that are given by name, one behind the other."""
+    """Join the numbers of joints that are given by name."""
     parts = [as_tensor(value, f"joint {name!r}").reshape(-1) for name, value in joints.items()]
     return torch.cat(parts) if parts else torch.empty(0)
 
 
-def _columns(
-    wanted: Sequence[str], present: tuple[str, ...] | None, where: str
-) -> list[int] | None:
-    """Where the wanted joints stand among those present; None if as they are, or unnamed."""
+def _reorder[Given: (Demonstration, Situation)](
+    given: Given, wanted: Sequence[str], where: str
+) -> Given:
+    """Select wanted joints, in their order; all as they are where they are unnamed."""
+    present = given.joint_names
     if present is None or present == tuple(wanted):
-        return None
+        return given
     for name in wanted:
         if name not in present:
             raise UnknownNameError("joint", name, where, present)
-    return [present.index(name) for name in wanted]
+    columns = [present.index(name) for name in wanted]
+    return replace(given, joints=given.joints[..., columns], joint_names=tuple(wanted))
 
 
 def check_robot(robot: Any) -> None:
@@ -421,7 +417,7 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
         names = names or item.joint_names or ()
     for index, item in enumerate(checked):
         _check_alike(index, item, checked[0], names)
-    return [item.reordered(names) for item in checked]
+    return [item.reorder(names) for item in checked]
 
 
 def _check_alike(

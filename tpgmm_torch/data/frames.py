@@ -83,8 +83,7 @@ class Frame:
         # what is of unit norm but for rounding stays as it is, bit for bit
         rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps
         norm = norm - torch.where(rounded, excess, 0.0)
-        object.__setattr__(self, "position", position)
-        object.__setattr__(self, "orientation", orientation / norm)
+        vars(self).update(position=position, orientation=orientation / norm)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -92,25 +91,25 @@ class Frame:
         return self.position.shape[:-1]
 
     def to(self, *args: Any, **kwargs: Any) -> Frame:
-        """A copy on another device or of another dtype, like :meth:`torch.Tensor.to`."""
+        """Copy to another device or dtype, like :meth:`torch.Tensor.to`."""
         parts = (part.to(*args, **kwargs) for part in (self.position, self.orientation))
         moved = self.from_checked(*parts)
         vars(moved).update(at=self.at)
         return moved
 
     def expand(self, batch: Sequence[int]) -> Frame:
-        """The same pose for all of a batch, without copying."""
+        """Expand one pose to a batch, without copying."""
         return self.from_checked(
             self.position.expand(*batch, 3), self.orientation.expand(*batch, 4)
         )
 
     def flatten(self) -> Frame:
-        """The leading dimensions as one."""
+        """Flatten the leading dimensions into one."""
         return self.from_checked(self.position.reshape(-1, 3), self.orientation.reshape(-1, 4))
 
     @classmethod
     def stack(cls, frames: Sequence[Frame]) -> Frame:
-        """Poses of B situations as one frame of shape (B,), or (T, B) if any of them moves.
+        """Stack poses of B situations: shape (B,), or (T, B) if any of them moves.
 
         Parameters
         ----------
@@ -125,7 +124,7 @@ class Frame:
         )
 
     def between(self, lower: Tensor, fraction: Tensor) -> Frame:
-        """Poses between time steps: positions by straight lines, orientations by slerp.
+        """Interpolate between time steps: positions linearly, orientations by slerp.
 
         Parameters
         ----------
@@ -142,8 +141,8 @@ class Frame:
             quaternions.slerp(turn[lower], turn[lower + 1], fraction),
         )
 
-    def resampled(self, recorded: Tensor, wanted: Tensor) -> Frame:
-        """A moving frame at other times; before the first and after the last it stands still.
+    def resample(self, recorded: Tensor, wanted: Tensor) -> Frame:
+        """Resample a moving frame; before the first and after the last time it stands still.
 
         Parameters
         ----------
@@ -166,21 +165,21 @@ class Frame:
         return self.from_checked(self.position[index], self.orientation[index])
 
     def inverse_transform(self, point: Tensor) -> Tensor:
-        """``R^T (x - p)``: points (..., 3) of the base frame, seen from this frame."""
+        """Compute ``R^T (x - p)``: points (..., 3) of the base frame, seen from this frame."""
         turn = quaternions.conjugate(self.orientation)
         return quaternions.rotate(turn, point - self.position)
 
     def transform(self, point: Tensor) -> Tensor:
-        """``R x + p``: points (..., 3) of this frame, seen from the base frame."""
+        """Compute ``R x + p``: points (..., 3) of this frame, seen from the base frame."""
         return quaternions.rotate(self.orientation, point) + self.position
 
     def compose(self, inner: Frame) -> Frame:
-        """The pose, in the base frame, of what has the pose ``inner`` in this frame."""
+        """Compute the pose, in the base frame, of what has the pose ``inner`` in this frame."""
         turned = quaternions.product(self.orientation, inner.orientation)
         return self.from_checked(self.transform(inner.position), turned)
 
     def change(self, other: Frame, distance: float, angle: float) -> Tensor:
-        """How far another pose is from this one, in units of a distance and an angle: (...).
+        """Measure the change to another pose, in units of a distance and an angle: (...).
 
         Parameters
         ----------
@@ -194,7 +193,7 @@ class Frame:
         return torch.maximum(moved / distance, 2 * torch.acos(inner) / angle)
 
     def seen_from(self, other: Frame) -> Frame:
-        """The pose in another frame: ``other.compose(pose.seen_from(other))`` is the pose."""
+        """Express the pose in another frame: ``other.compose(pose.seen_from(other))`` is it."""
         turn = quaternions.conjugate(other.orientation)
         return self.from_checked(
             other.inverse_transform(self.position), quaternions.product(turn, self.orientation)
@@ -212,6 +211,5 @@ class Frame:
             Unit quaternions (w, x, y, z).
         """
         frame = cls.__new__(cls)
-        object.__setattr__(frame, "position", position)
-        object.__setattr__(frame, "orientation", orientation)
+        vars(frame).update(position=position, orientation=orientation)
         return frame

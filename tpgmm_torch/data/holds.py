@@ -75,7 +75,7 @@ class Hold:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The hold that a text stands for, ``FRAME@LINK:BEGIN-END``.
+        """Parse a text, ``FRAME@LINK:BEGIN-END``.
 
         Parameters
         ----------
@@ -101,8 +101,8 @@ class Hold:
         begin, end = ("" if math.isinf(at) else repr(at) for at in (self.begin, self.end))
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
 
-    def retimed(self, clock: Callable[[float], float]) -> Self:
-        """The same hold on another clock.
+    def retime(self, clock: Callable[[float], float]) -> Self:
+        """Put the hold on another clock.
 
         Parameters
         ----------
@@ -120,11 +120,12 @@ class Hold:
 def check_holds(
     holds: Iterable[Any], frames: Collection[str], links: Collection[str] | None = None
 ) -> tuple[Hold, ...]:
-    """Holds in the order of their beginnings, checked to be possible.
+    """Check that holds are possible, and sort them by their beginnings.
 
     Parameters
     ----------
     holds : iterable of Hold
+        What links hold, in any order.
     frames : collection of str
         The objects that there are.
     links : collection of str

@@ -16,14 +16,14 @@ _SIDES = {"l": "left", "r": "right"}
 
 
 def words(name: str) -> tuple[str, ...]:
-    """Words of a name in any spelling: ``kLeftElbow``, ``left_elbow_joint``, ``l_elbow``."""
+    """Split a name in any spelling: ``kLeftElbow``, ``left_elbow_joint``, ``l_elbow``."""
     spelled = [word.lower() for word in _WORDS.findall(name)]
     spoken = tuple(_SIDES.get(word, word) for word in spelled if word not in _SILENT)
     return spoken or tuple(spelled)
 
 
 def is_gripper(name: str) -> bool:
-    """Whether a joint's name is that of a gripper, which may have any unit.
+    """Check whether a joint's name is that of a gripper, which may have any unit.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def is_gripper(name: str) -> bool:
 def pose_groups(
     names: Sequence[str] | None, parts: tuple[str, ...] = POSE_PARTS
 ) -> dict[str, tuple[int, ...]]:
-    """Positions of the seven parts of every pose among the names.
+    """Find the positions of the seven parts of every pose among the names.
 
     A pose ``bottle`` is there when ``bottle.x``, ... ``bottle.qz`` (or ``bottle_x``, ...) are.
 
@@ -64,7 +64,7 @@ def pose_groups(
 
 
 def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
-    """Positions of (w, x, y, z) of every quaternion among the names.
+    """Find the positions of (w, x, y, z) of every quaternion among the names.
 
     Parameters
     ----------

@@ -93,11 +93,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     Attributes
     ----------
     weights_ : Tensor of shape (K,)
+        Shares of the components; they add up to 1.
     means_ : list of Tensor of shape (K, D_j)
         One per block.
     covariances_ : list of Tensor of shape (K, D_j, D_j)
         One per block, full matrices whatever the ``covariance_type``.
     converged_ : bool
+        Whether the best start came to its end before ``max_iter``.
     n_iter_ : int
         Iterations of the best start.
     lower_bound_ : float
@@ -107,6 +109,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Its history, which never falls. Where reseeding a component lowers it, the history
         begins again at that point.
     n_features_in_ : int
+        Number of columns of all blocks.
 
     Warns
     -----
@@ -174,7 +177,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     def from_parameters(
         cls, weights: Any, means: Sequence[Any], covariances: Sequence[Any], **settings: Any
     ) -> Self:
-        """A fitted mixture from weights (K,), means (K, D_j), covariances (K, D_j, D_j).
+        """Make a mixture of weights (K,), means (K, D_j), covariances (K, D_j, D_j).
 
         Parameters
         ----------
@@ -204,8 +207,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         shares, count = tensors[0], len(widths)
         if bool((shares < 0).any()) or abs(float(shares.sum()) - 1) > 1e-3:
             raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
-        own = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
-        whiten(parameters := Parameters(shares / shares.sum(), *own))
+        moments = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
+        whiten(parameters := Parameters(shares / shares.sum(), *moments))
         return model._set(parameters)
 
     def fit(
@@ -285,20 +288,20 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         scale: Tensor,
         rng: RandomState,
     ) -> list[Parameters]:
-        """Where EM begins, in standardised units."""
+        """Choose where EM begins, in standardised units."""
         if start is None:
-            own = self.init_params, self.n_init, self.n_components
-            return draw_starts(*own, points, family, rng)
+            settings = self.init_params, self.n_init, self.n_components
+            return draw_starts(*settings, points, family, rng)
         given = len(start.weights_), [*map(_width, start.means_)]
         if given != (self.n_components, points.widths):
             raise ShapeError(
                 f"the start has {given[0]} components in blocks of {given[1]} columns, "
                 f"asked for are {self.n_components} in blocks of {points.widths}"
             )
-        return [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
+        return [family.admit(start._parameters().affine(1 / scale, -shift / scale))]
 
     def _rows(self, X: Any) -> Rows:
-        """The rows of X, checked."""
+        """Check the rows of X."""
         rows: Rows = X
         if not isinstance(X, RowFile):
             kinds = [np.float64, np.float32]
@@ -310,7 +313,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return rows
 
     def _widths(self, n_features: int) -> list[int]:
-        """Widths of the blocks, checked against the data."""
+        """Check widths of the blocks against the data."""
         widths = [n_features] if self.blocks is None else list(self.blocks)
         if not all(isinstance(width, Integral) and width > 0 for width in widths):
             raise ShapeError(f"blocks must be positive integers, got {self.blocks!r}")
@@ -322,7 +325,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return list(map(int, widths))
 
     def _family(self, widths: list[int]) -> CovarianceFamily:
-        """The covariances that are admitted, in standardised units."""
+        """Make the family of admitted covariances, in standardised units."""
         shares = np.asarray(self.reg_covar, dtype=np.float64)
         if shares.shape not in ((), (sum(widths),)):
             raise ShapeError(
@@ -347,11 +350,12 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def score_samples(self, X: Any) -> NDArray[np.floating]:
-        """Log-density of each point.
+        """Compute the log-density of each point.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Points, one in each row.
 
         Returns
         -------
@@ -360,15 +364,16 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self._evaluate(X, lambda joint: joint.logsumexp(0))
 
     def score(self, X: Any, y: Any = None) -> float:
-        """Mean log-density of the points X (n_samples, n_features)."""
+        """Compute the mean log-density of the points X (n_samples, n_features)."""
         return float(self.score_samples(X).mean(dtype=np.float64))
 
     def predict_proba(self, X: Any) -> NDArray[np.floating]:
-        """Responsibilities of the components for each point.
+        """Compute responsibilities of the components for each point.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Points, one in each row.
 
         Returns
         -------
@@ -377,13 +382,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self._evaluate(X, lambda joint: joint.softmax(0).T)
 
     def predict(self, X: Any) -> NDArray[np.int64]:
-        """Most probable component of each of the points X, shape (n_samples,)."""
+        """Return the most probable component of each of the points X, shape (n_samples,)."""
         return self._evaluate(X, lambda joint: joint.argmax(0))
 
     @property
     def n_parameters_(self) -> int:
         """Number of free parameters: weights, means, and covariances of all blocks."""
-        k, widths = len(self._fitted().weights), list(map(_width, self.means_))
+        k, widths = len(self._parameters().weights), list(map(_width, self.means_))
         triangles = sum(width * (width + 1) // 2 for width in widths)
         covariances = {
             "full": k * triangles,
@@ -394,7 +399,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return k - 1 + k * sum(widths) + covariances[self.covariance_type]
 
     def bic(self, X: Any) -> float:
-        """Bayesian information criterion on X (n_samples, n_features); lower is better."""
+        """Compute the Bayesian information criterion on X (n_samples, n_features)."""
         return -2 * len(X) * self.score(X) + self.n_parameters_ * math.log(len(X))
 
     def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
@@ -403,6 +408,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Parameters
         ----------
         n_samples : int, default=1
+            Number of points.
 
         Returns
         -------
@@ -410,7 +416,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         labels : array of shape (n_samples,)
             The components that they came from, in ascending order.
         """
-        parameters = self._fitted()
+        parameters = self._parameters()
         if not isinstance(n_samples, Integral) or n_samples < 1:
             raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
         rng = check_random_state(self.random_state)
@@ -424,24 +430,26 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             columns.append(mean.cpu().numpy()[labels] + (factor[labels] @ normal)[..., 0])
         return np.concatenate(columns, axis=1).astype(self.dtype), labels
 
-    def _fitted(self) -> Parameters:
-        """The fitted mixture in float64."""
+    def _parameters(self) -> Parameters:
+        """Return the fitted mixture in float64."""
         if not hasattr(self, "weights_"):
             raise NotFittedError(
                 f"this {type(self).__name__} is not fitted yet; call fit before this method"
             )
-        own = (tuple(x.double() for x in each) for each in (self.means_, self.covariances_))
-        return Parameters(self.weights_.double(), *own)
+        doubled = (
+            tuple(x.double() for x in blocks) for blocks in (self.means_, self.covariances_)
+        )
+        return Parameters(self.weights_.double(), *doubled)
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
         """Apply a function to the log of weight times density, (K, n), of the rows."""
-        parameters, dtype = self._fitted(), self.weights_.dtype
+        parameters, dtype = self._parameters(), self.weights_.dtype
         points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
         # centred, so that offsets cost no digits
         center = torch.cat([parameters.weights @ mean for mean in parameters.means])
         exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
-        maps, peaks = [own.to(dtype) for own in exact], peaks.to(dtype)
-        widths, found = [own.shape[1] for own in maps], []
+        maps, peaks = [block_map.to(dtype) for block_map in exact], peaks.to(dtype)
+        widths, found = [block_map.shape[1] for block_map in maps], []
         for start in range(0, len(points), FILE_ROWS):
             rows = torch.from_numpy(np.array(points[start : start + FILE_ROWS])).to(center)
             blocks = [
@@ -457,7 +465,7 @@ def _width(block: Tensor) -> int:
 
 
 def _on_cpu(X: Any) -> Any:
-    """X as an array if it is a tensor, as it is if not."""
+    """Convert X to an array if it is a tensor."""
     return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
 
 

@@ -28,7 +28,7 @@ __all__ = ["moderated_variances", "shrink", "shrinkage_intensity", "trigamma_inv
 def shrinkage_intensity(
     covariance: Tensor, intensity: float | str, n_samples: Tensor | float
 ) -> Tensor:
-    """The share l by which covariances go towards their diagonals, (...), from 0 to 1.
+    """Compute the share l by which covariances go towards their diagonals, (...).
 
     "auto" is the oracle approximating shrinkage of Chen et al., equation (23), of the
     correlations R, for which the identity that it shrinks to is the diagonal: with
@@ -40,6 +40,7 @@ def shrinkage_intensity(
     covariance : Tensor of shape (..., D, D)
         Positive definite.
     intensity : float or "auto"
+        The share itself, or "auto" to estimate it.
     n_samples : float or Tensor of shape (...)
         How many independent samples a covariance was learned from.
     """
@@ -65,7 +66,7 @@ def shrink(
     *,
     given: int = 0,
 ) -> Tensor:
-    """Covariances moved towards their diagonals, variances of one unit moderated by each other.
+    """Move covariances towards their diagonals, variances of one unit towards each other.
 
     ``C <- (1 - l) C + l diag(C)``, where C is the covariance of what follows the first
     ``given`` columns, given these: how the other columns depend on them stays as it is. Then
@@ -74,6 +75,7 @@ def shrink(
     Parameters
     ----------
     covariances : Tensor of shape (K, D, D)
+        Positive definite, one for each component.
     intensity : float or "auto"
         The share l, from 0 to 1, as in :func:`shrinkage_intensity`.
     n_samples : float or Tensor of shape (K,)
@@ -87,13 +89,15 @@ def shrink(
     """
     before, mixed = covariances[:, :given, :given], covariances[:, given:, :given]
     explained = mixed @ torch.linalg.solve(before, mixed.mT)
-    own = covariances[:, given:, given:] - explained
-    if own.shape[-1] > 1:
-        share = shrinkage_intensity(own, intensity, n_samples)[:, None, None]
-        own = (1 - share) * own + share * torch.diag_embed(own.diagonal(dim1=1, dim2=2))
-    freedom = torch.as_tensor(n_samples).to(own).expand(len(own)) - 1.0
+    residual = covariances[:, given:, given:] - explained
+    if residual.shape[-1] > 1:
+        share = shrinkage_intensity(residual, intensity, n_samples)[:, None, None]
+        residual = (1 - share) * residual + share * torch.diag_embed(
+            residual.diagonal(dim1=1, dim2=2)
+        )
+    freedom = torch.as_tensor(n_samples).to(residual).expand(len(residual)) - 1.0
     several = freedom > 0
-    variances = own.diagonal(dim1=1, dim2=2)
+    variances = residual.diagonal(dim1=1, dim2=2)
     moderated = variances.clone()
     for unit in sorted({unit for unit in units[given:] if unit is not None}):
         alike = [column for column, other in enumerate(units[given:]) if other == unit]
@@ -102,12 +106,12 @@ def shrink(
             moderated[:, alike] = found.where(several[:, None], variances[:, alike])
     ratio = (moderated / variances).sqrt()
     shrunk = covariances.clone()
-    shrunk[:, given:, given:] = own * ratio[:, :, None] * ratio[:, None] + explained
+    shrunk[:, given:, given:] = residual * ratio[:, :, None] * ratio[:, None] + explained
     return shrunk
 
 
 def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
-    """Posterior variances under a prior estimated from the variances themselves, (..., G).
+    """Compute posterior variances (..., G) under a prior estimated from them.
 
     With ``s_g^2 ~ sigma_g^2 chi^2_n / n`` and ``1 / sigma_g^2 ~ chi^2_m / (m s_0^2)`` it is
     ``(m s_0^2 + n s_g^2) / (m + n)``: the prior counts like m more degrees of freedom. Mean and
@@ -136,7 +140,7 @@ def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
 
 
 def trigamma_inverse(value: Tensor, n_steps: int = 20) -> Tensor:
-    """The x with ``trigamma(x) = value``, elementwise, of positive values.
+    """Solve ``trigamma(x) = value`` for x, elementwise, of positive values.
 
     By Newton's method on ``1 / trigamma``, which is convex from the start on and converges from
     there (Smyth, appendix); each of ``n_steps`` doubles the number of right digits.

@@ -25,8 +25,8 @@ from tpgmm_torch.mixture.row_file import FILE_ROWS
 
 __all__ = [
     "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
-    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step", "reseed",
-    "whiten",
+    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step",
+    "restart_components", "whiten",
 ]  # fmt: skip
 
 #: A component is left out of a chunk where its responsibilities are below exp(-36), rounding,
@@ -50,6 +50,7 @@ class Parameters:
     Parameters
     ----------
     weights : Tensor of shape (K,)
+        Positive; they add up to 1.
     means : tuple of Tensor of shape (K, D_j)
         One per block.
     covariances : tuple of Tensor of shape (K, D_j, D_j)
@@ -61,7 +62,7 @@ class Parameters:
     covariances: tuple[Tensor, ...]
 
     def affine(self, scale: Tensor, shift: Tensor) -> Parameters:
-        """The mixture of ``scale * x + shift``; scale and shift are of shape (sum D_j,)."""
+        """Compute the mixture of ``scale * x + shift``, both of shape (sum D_j,)."""
         widths = [mean.shape[1] for mean in self.means]
         scales, shifts = scale.split(widths), shift.split(widths)
         means = [m * s + b for m, s, b in zip(self.means, scales, shifts, strict=True)]
@@ -78,6 +79,7 @@ class CovarianceFamily:
     Parameters
     ----------
     covariance_type : {"full", "tied", "diag", "spherical"}
+        As of the estimator.
     diagonals : tuple of Tensor of shape (D_j,)
         Per block the diagonal of the regularisation ``Lambda``.
     """
@@ -86,7 +88,7 @@ class CovarianceFamily:
     diagonals: tuple[Tensor, ...]
 
     def restrict(self, covariance: Tensor, weights: Tensor) -> Tensor:
-        """The most likely member for scatter matrices (K, D_j, D_j) and weights (K,)."""
+        """Find the most likely member for scatter (K, D_j, D_j) and weights (K,)."""
         diagonal = covariance.diagonal(dim1=1, dim2=2)
         match self.covariance_type:
             case "tied":
@@ -121,7 +123,7 @@ class CovarianceFamily:
 
 
 def whiten(parameters: Parameters) -> tuple[list[Tensor], Tensor]:
-    """Maps to whitened coordinates ``L_k^-1 (x_j - mu_kj)``, and log-densities at the means.
+    """Compute maps to whitened ``L_k^-1 (x_j - mu_kj)``, and log-densities at the means.
 
     Parameters
     ----------
@@ -179,8 +181,8 @@ def log_joint(
     list of Tensor of shape (K, D_j, n)
     """
     joint, whitened = peaks[:, None], []
-    for x, own in zip(blocks, maps, strict=True):
-        y = (own.flatten(0, 1) @ x).view(*own.shape[:2], -1)
+    for x, block_map in zip(blocks, maps, strict=True):
+        y = (block_map.flatten(0, 1) @ x).view(*block_map.shape[:2], -1)
         joint = torch.sub(joint, y.square().sum(1), alpha=0.5)
         whitened.append(y)
     if group_size > 1:
@@ -218,7 +220,7 @@ class Expectation:
 
 
 def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) -> Expectation:
-    """One pass over the points, in which each chunk meets only the components near it in time.
+    """Pass over the points, each chunk with the components near it in time.
 
     Within a chunk no log-density of component k exceeds ``ub_k``, that at its mean less
     ``sum_j gap_kj^2 / 2 sigma_kj^2``, where ``gap_kj`` is how far the mean lies from the
@@ -233,6 +235,7 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     parameters : Parameters
         In the units of the points.
     points : Points
+        What the mixture is learned from.
     least : Tensor of shape (n_chunks,), optional
         That of the last pass; without it all components are evaluated at all points.
     """
@@ -243,15 +246,18 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     limits = torch.minimum(least, ceilings.amax(1)) - (NEGLIGIBLE + MARGIN)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
-    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    rounded, heights = (
+        [block_map.to(points.dtype) for block_map in maps],
+        peaks.to(points.dtype),
+    )
     found, lowest = _Sums.zero(maps, peaks), []
     for (chunk, _), index, limit, ceiling in zip(
         points, chosen, limits.tolist(), ceilings, strict=True
     ):
         blocks = points.blocks(chunk)
         while True:
-            own = [m[index] for m in rounded], heights[index]
-            joint, whitened = log_joint(blocks, *own, points.group_size)
+            near = [block_map[index] for block_map in rounded], heights[index]
+            joint, whitened = log_joint(blocks, *near, points.group_size)
             density = joint.logsumexp(0)
             lowest.append(float(density.min()))
             if not limit > lowest[-1] - NEGLIGIBLE:  # nor where it is NaN
@@ -266,14 +272,16 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
 
 
 def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expectation:
-    """The pass in which each point belongs to one component.
+    """Pass over the points, each of which belongs to one component.
 
     Parameters
     ----------
     points : Points
+        What the mixture is learned from.
     labeller : callable
         Gives the components of points.
     n_components : int
+        Number of components K.
     """
     like = points.shift
     zeros = [like.new_zeros(n_components, width) for width in points.widths]
@@ -281,7 +289,10 @@ def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expe
     shares = like.new_full((n_components,), 1 / n_components)
     unit = Parameters(shares, tuple(zeros), tuple(ones))
     maps, peaks = whiten(unit)
-    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    rounded, heights = (
+        [block_map.to(points.dtype) for block_map in maps],
+        peaks.to(points.dtype),
+    )
     found = _Sums.zero(maps, peaks)
     for chunk, numbers in points:
         labels = labeller(chunk[points.values].T, numbers)
@@ -303,7 +314,9 @@ class _Sums:
 
     @classmethod
     def zero(cls, maps: Sequence[Tensor], peaks: Tensor) -> _Sums:
-        moments = [own.new_zeros(own.shape[2], *own.shape[:2]) for own in maps]
+        moments = [
+            block_map.new_zeros(block_map.shape[2], *block_map.shape[:2]) for block_map in maps
+        ]
         return cls(torch.zeros_like(peaks), torch.zeros_like(peaks[0]), moments)
 
     def add(
@@ -311,22 +324,22 @@ class _Sums:
     ) -> None:
         """Add a chunk, given the responsibilities (K', n) of some components."""
         self.mass.index_add_(0, index, gamma.sum(1, dtype=self.mass.dtype))
-        for x, y, own in zip(blocks, whitened, self.moments, strict=True):
+        for x, y, moments in zip(blocks, whitened, self.moments, strict=True):
             y.mul_(gamma[:, None])
             part = (x @ y.flatten(0, 1).T).view(len(x), len(index), -1)
-            own.index_add_(1, index, part.double())
+            moments.index_add_(1, index, part.double())
 
     def expectation(
         self, parameters: Parameters, maps: Sequence[Tensor], points: Points, least: Tensor
     ) -> Expectation:
-        """The sums of all processes."""
+        """Add up the sums of all processes."""
         mass, total, *sums = points.processes.sum(self.mass, self.total, *self.moments)
-        rounded, bound = [own.double() for own in maps], float(total) / points.total
+        rounded, bound = [block_map.double() for block_map in maps], float(total) / points.total
         return Expectation(parameters, rounded, mass, sums, bound, least)
 
 
 def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
-    """Upper bounds of the log-densities of the components in each chunk, (n_chunks, K)."""
+    """Bound the log-densities of the components in each chunk, (n_chunks, K)."""
     mean = torch.stack([mean[:, 0] for mean in parameters.means], 1)
     variance = torch.stack([covariance[:, 0, 0] for covariance in parameters.covariances], 1)
     low, high = spans[:, :, None].unbind(1)
@@ -335,12 +348,14 @@ def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
 
 
 def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -> Parameters:
-    """The mixture that the responsibilities ask for.
+    """Compute the mixture that the responsibilities ask for.
 
     Parameters
     ----------
     expectation : Expectation
+        Sums of a pass over the points.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     floor : bool
         False adds ``Lambda`` to every covariance, as scikit-learn does: close to the most
         likely mixture, but not exactly it, so that the likelihood can fall by a little.
@@ -353,12 +368,12 @@ def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -
     alive = (mass > torch.finfo(mass.dtype).tiny)[:, None]
     divisor = torch.where(alive, mass[:, None], 1.0)
     means, covariances = [], []
-    for block, (maps, own) in enumerate(zip(expectation.maps, expectation.sums, strict=True)):
+    for block, (maps, sums) in enumerate(zip(expectation.maps, expectation.sums, strict=True)):
         width = maps.shape[1]
         whitening, offset = maps[..., :width], maps[..., width]
         # mean and scatter in whitened coordinates, where the old ones are 0 and the identity
-        shift = own[width] / divisor
-        scatter = own.permute(1, 2, 0) @ maps.mT / divisor[..., None]
+        shift = sums[width] / divisor
+        scatter = sums.permute(1, 2, 0) @ maps.mT / divisor[..., None]
         scatter = scatter - shift[..., None] * shift[:, None]
         scatter = torch.where(alive[..., None], scatter, torch.eye(width).to(scatter))
         back = torch.linalg.inv(whitening)
@@ -372,7 +387,7 @@ def m_step(expectation: Expectation, family: CovarianceFamily, *, floor: bool) -
 def dead_components(
     expectation: Expectation, family: CovarianceFamily, points: Points
 ) -> Tensor:
-    """Which components have lost their data, shape (K,).
+    """Find components that have lost their data, shape (K,).
 
     Either nothing is left of its mass, or at most two points are, without any spread
     beyond the regularisation, though there is data enough to give each component more.
@@ -384,6 +399,7 @@ def dead_components(
     family : CovarianceFamily
         With the regularisation.
     points : Points
+        What the mixture is learned from.
     """
     mass = expectation.mass
     vanished = mass < 10 * torch.finfo(points.dtype).eps * points.total
@@ -393,7 +409,7 @@ def dead_components(
     return vanished | (few & (torch.cat(variances, 1).sum(1) <= 2 * floor))
 
 
-def reseed(
+def restart_components(
     proposal: Parameters,
     dead: Tensor,
     explaining: Parameters,
@@ -410,9 +426,11 @@ def reseed(
     proposal : Parameters
         What the M step gave.
     dead : Tensor of bool, of shape (K,)
+        Components to be moved.
     explaining : Parameters
         The mixture of the E step, whose densities count.
     points : Points
+        What the mixture is learned from.
     rng : RandomState
         In the same state in all processes.
     """
@@ -432,9 +450,9 @@ def reseed(
 
 
 def _worst(parameters: Parameters, points: Points, count: int) -> Tensor:
-    """The points of lowest density (count, sum D_j), worst first."""
+    """Find the points of lowest density (count, sum D_j), worst first."""
     maps, peaks = whiten(parameters)
-    maps, peaks = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    maps, peaks = [block_map.to(points.dtype) for block_map in maps], peaks.to(points.dtype)
     worst = peaks.new_zeros(0, 1 + len(points.values))
     for chunk, _ in points:
         joint, _ = log_joint(points.blocks(chunk), maps, peaks, points.group_size)
@@ -452,11 +470,14 @@ class Fit:
     Attributes
     ----------
     parameters : Parameters
+        The mixture after the last M step.
     bounds : list of float
         Mean log-likelihood of the mixture before each M step, never falling: where reseeding
         a component lowers it, the list begins again.
     n_iter : int
+        Number of M steps.
     converged : bool
+        Whether the bound rose by less than the tolerance.
     reseedings : list of str
         Which components were reseeded when, as text.
     """
@@ -489,10 +510,13 @@ def expectation_maximization(
     start : Parameters
         A mixture of the family.
     points : Points
+        What the mixture is learned from.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     rng : RandomState
         Chooses where dead components start again; in the same state in all processes.
     tol : float
+        Rise of the bound at which EM ends [nats].
     max_iter : int
         Most M steps, at least 1.
     """
@@ -508,7 +532,7 @@ def expectation_maximization(
             left -= n_dead
             components = dead.nonzero()[:, 0].tolist()
             fit.reseedings.append(f"component(s) {components} in iteration {fit.n_iter}")
-            proposal = reseed(proposal, dead, current.parameters, points, rng)
+            proposal = restart_components(proposal, dead, current.parameters, points, rng)
             following = e_step(proposal, points, current.least)
             fit.bounds = [] if following.bound < lowest else [*fit.bounds, current.bound]
         else:

@@ -30,7 +30,7 @@ def draw_starts(
     family: CovarianceFamily,
     rng: RandomState,
 ) -> list[Parameters]:
-    """So many starts: the Gaussians of the points that each component was given.
+    """Draw starts: the Gaussians of the points that each component was given.
 
     Parameters
     ----------
@@ -38,8 +38,11 @@ def draw_starts(
         Equal bins along time, bins of random sizes from the second start on; clusters of
         scikit-learn's k-means (one run); the nearest of some distinct points drawn at random.
     n_starts, n_components : int
+        Number of starts, and of components of each.
     points : Points
+        What the mixture is learned from.
     family : CovarianceFamily
+        Of covariances, with their regularisation.
     rng : RandomState
         In the same state in all processes.
 
@@ -70,7 +73,7 @@ def draw_starts(
         labellers = _bins_along_time(n_starts, n_components, points, rng)
     else:
         found = [torch.from_numpy(centers()) for _ in range(n_starts)]
-        labellers = [nearest(own.to(points.shift)) for own in found]
+        labellers = [nearest(start_centers.to(points.shift)) for start_centers in found]
     steps = (labelled_step(points, labeller, n_components) for labeller in labellers)
     return [m_step(step, family, floor=False) for step in steps]
 
@@ -78,17 +81,17 @@ def draw_starts(
 def _bins_along_time(
     n_starts: int, n_bins: int, points: Points, rng: RandomState
 ) -> list[Labeller]:
-    """Equal bins, and bins of random sizes from the second start on."""
+    """Make equal bins, and bins of random sizes from the second start on."""
     # groups stay together, unless they are too few
     group_size = points.group_size if points.total // points.group_size >= n_bins else 1
     sample, numbers = points.sample(group_size)
     times = sample[:, 0].to(points.dtype)
     sizes = [bin_sizes(len(times), n_bins, rng if k else None) for k in range(n_starts)]
-    return [time_bins(times, numbers, own, group_size) for own in sizes]
+    return [time_bins(times, numbers, sizes_of_start, group_size) for sizes_of_start in sizes]
 
 
 def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> list[int]:
-    """Sizes of bins that together hold ``n_points`` points, each at least one.
+    """Divide ``n_points`` points into bins, each of at least one.
 
     Parameters
     ----------
@@ -109,7 +112,7 @@ def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> lis
 
 
 def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int) -> Labeller:
-    """Bins along time whose limits are quantiles of a sample of the points.
+    """Bin along time, with quantiles of a sample of the points as limits.
 
     They hold points in the given proportions: exactly, if the sample is all points. Points of
     equal time are in the order of their numbers, so that no bin is empty.
@@ -128,8 +131,8 @@ def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int)
     firsts = times.argsort(stable=True)[np.cumsum(sizes)[:-1]]
     limits, limit_numbers = times[firsts, None], numbers[firsts, None]
 
-    def labels(rows: Tensor, own: Tensor) -> Tensor:
-        time, number = rows[::group_size, 0], own[::group_size] // group_size
+    def labels(rows: Tensor, row_numbers: Tensor) -> Tensor:
+        time, number = rows[::group_size, 0], row_numbers[::group_size] // group_size
         beyond = (time > limits) | ((time == limits) & (number >= limit_numbers))
         return beyond.sum(0).repeat_interleave(group_size)
 
@@ -137,7 +140,7 @@ def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int)
 
 
 def nearest(centers: Tensor) -> Labeller:
-    """The nearest of some centers (K, sum D_j)."""
+    """Label points by the nearest of some centers (K, sum D_j)."""
     # differences, not norms and products: a center is nearest to itself, rounding or not
     mode = "donot_use_mm_for_euclid_dist"
     return lambda rows, _: torch.cdist(rows.to(centers), centers, compute_mode=mode).argmin(1)

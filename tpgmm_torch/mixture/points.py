@@ -40,6 +40,7 @@ class Points:
     n_components : int
         Of the mixture, which decides how large a chunk is.
     dtype : torch.dtype
+        Of the standardised rows.
     group_size : int
         So many consecutive rows stay together.
     processes : Processes
@@ -79,7 +80,7 @@ class Points:
         self.spans = torch.stack(spans).double()
 
     def __iter__(self) -> Iterator[Chunk]:
-        """One pass over the rows of this process."""
+        """Pass once over the rows of this process."""
         if isinstance(self._rows, np.ndarray):
             self._kept = self._kept or list(self._pass(self._rows, len(self._rows)))
             return iter(self._kept)
@@ -96,21 +97,21 @@ class Points:
             memory = self.scale.new_ones(len(piece) * height, dtype=self.dtype)
             numbers = torch.from_numpy(order + start + self._first).to(memory.device)
             for first in range(0, len(order), self._size):
-                own = order[first : first + self._size]
-                chunk = memory[first * height :][: len(own) * height].view(height, -1)
-                chunk[self.values] = self.standardized(piece[own]).T.to(self.dtype)
-                yield chunk, numbers[first : first + len(own)]
+                chunk_rows = order[first : first + self._size]
+                chunk = memory[first * height :][: len(chunk_rows) * height].view(height, -1)
+                chunk[self.values] = self.standardize(piece[chunk_rows]).T.to(self.dtype)
+                yield chunk, numbers[first : first + len(chunk_rows)]
 
-    def standardized(self, rows: NDArray[np.floating]) -> Tensor:
-        """Rows (n, sum D_j) of the data in standardised units, in float64."""
+    def standardize(self, rows: NDArray[np.floating]) -> Tensor:
+        """Standardise rows (n, sum D_j) of the data, in float64."""
         return (torch.from_numpy(rows).to(self.shift) - self.shift).div_(self.scale)
 
     def blocks(self, chunk: Tensor) -> tuple[Tensor, ...]:
-        """The blocks (x_j; 1) of a chunk, each of shape (D_j + 1, n)."""
+        """Split a chunk into blocks (x_j; 1), each of shape (D_j + 1, n)."""
         return chunk.split([width + 1 for width in self.widths])
 
     def sample(self, every: int = 1) -> tuple[Tensor, Tensor]:
-        """At most ``FILE_ROWS`` rows of all processes; all of them where they are no more.
+        """Draw at most ``FILE_ROWS`` rows of all processes; all where they are no more.
 
         Parameters
         ----------
@@ -129,6 +130,6 @@ class Points:
             draws = np.random.RandomState(0).randint(0, len(wanted), FILE_ROWS)
             wanted = np.unique(draws)
         places = wanted * every - self._first
-        own = places[(places >= 0) & (places < len(self._rows))]
-        found = torch.cat(self.processes.gather(self.standardized(self._rows[own]).cpu()))
+        local_rows = places[(places >= 0) & (places < len(self._rows))]
+        found = torch.cat(self.processes.gather(self.standardize(self._rows[local_rows]).cpu()))
         return found.to(self.shift), torch.from_numpy(wanted).to(self.shift.device)

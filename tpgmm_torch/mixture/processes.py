@@ -70,14 +70,36 @@ class Processes:
         return tuple(p.view(t.shape).to(t.device) for p, t in zip(parts, tensors, strict=True))
 
     def gather(self, value: Any) -> list[Any]:
-        """The values of all processes, in their order: what pickle can carry."""
+        """Gather the values of all processes, in their order: what pickle can carry."""
         values: list[Any] = [value] * self.count
         if self.count > 1:
             _exchange(lambda: dist.all_gather_object(values, value))
         return values
 
+    @staticmethod
+    def check_share(shares: Sequence[Any], what: str) -> None:
+        """Refuse that a process has none of the data, or nobody has.
+
+        Parameters
+        ----------
+        shares : sequence
+            Something true of each process that has some.
+        what : str
+            How the error message calls the data.
+
+        Raises
+        ------
+        DataError
+            If there is none; the message says in which process.
+        """
+        if empty := [rank for rank, share in enumerate(shares) if not share]:
+            where = f" in process(es) {empty} of {len(shares)}" if len(shares) > 1 else ""
+            raise DataError(
+                f"there are no {what}s, X is empty{where}: expected at least one {what}"
+            )
+
     def share[T](self, items: Sequence[T]) -> list[T]:
-        """The consecutive part of ``items`` that is this process's, equal up to one.
+        """Select this process's consecutive part of ``items``, equal up to one.
 
         Raises
         ------
@@ -112,7 +134,7 @@ def _exchange(collective: Callable[[], object]) -> None:
 def joined_processes(
     device: str = "cpu", timeout: timedelta = timedelta(minutes=30)
 ) -> Iterator[Processes]:
-    """The processes that ``torchrun`` started; this one alone if it started none.
+    """Join the processes that ``torchrun`` started; this one alone if it started none.
 
     A default process group that exists already is used, and left as it is. Otherwise one is
     made from the environment that torchrun sets, and ended with the block.

@@ -46,7 +46,7 @@ class RowFile:
 
     @classmethod
     def of(cls, batches: Iterable[Any]) -> Self:
-        """The rows of batches of shape (n, n_features), checked as they are read once.
+        """Return the rows of batches of shape (n, n_features), checked as they are read once.
 
         Parameters
         ----------
@@ -104,11 +104,12 @@ Rows = NDArray[np.floating[Any]] | RowFile
 
 
 def pieces(rows: Rows) -> Iterator[NDArray[np.float64]]:
-    """All rows in float64, in blocks of as many as are read from a file at once.
+    """Yield all rows in float64, in blocks of as many as are read from a file at once.
 
     Parameters
     ----------
     rows : array of shape (n, n_features), or RowFile
+        In memory, or in a file.
     """
     for start in range(0, len(rows), FILE_ROWS):
         yield np.asarray(rows[start : start + FILE_ROWS], dtype=np.float64)
@@ -125,6 +126,7 @@ class ColumnMoments:
     mean, scatter : array of shape (n_features,)
         Mean, and sum of squared deviations from it.
     smallest, largest : array of shape (n_features,)
+        Range of each column.
     """
 
     count: int
@@ -135,7 +137,7 @@ class ColumnMoments:
 
     @classmethod
     def of(cls, rows: Rows, processes: Processes = ALONE) -> ColumnMoments:
-        """Moments of the rows (n, n_features) of all processes.
+        """Return moments of the rows (n, n_features) of all processes.
 
         Raises
         ------
@@ -143,17 +145,12 @@ class ColumnMoments:
             If a process has no rows, if the processes' rows have different numbers of
             columns, or if the variance overflows.
         """
-        counts, widths = zip(*processes.gather(rows.shape), strict=True)
-        if empty := [rank for rank, count in enumerate(counts) if not count]:
-            where = f" in process(es) {empty} of {processes.count}"
-            raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
-        if len(set(widths)) > 1:
-            raise DataError(f"the processes' rows have {widths} columns: all need the same")
+        count = _count_rows(rows, processes)
 
-        def everywhere(own: list[Array], joined: np.ufunc = np.add) -> Array:
-            return np.asarray(joined.reduce(processes.gather(joined.reduce(own))))
+        def everywhere(parts: list[Array], join: np.ufunc = np.add) -> Array:
+            return np.asarray(join.reduce(processes.gather(join.reduce(parts))))
 
-        count, first = sum(counts), processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
+        first = processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
         with np.errstate(over="ignore", invalid="ignore"):
             # seen from the first row, so that a constant column varies by nothing at all
             mean = first + everywhere([(part - first).sum(0) for part in pieces(rows)]) / count
@@ -165,7 +162,7 @@ class ColumnMoments:
         return cls(count, mean, scatter, low, high)
 
     def scales(self, widths: Sequence[int], *, isotropic: bool) -> Array:
-        """The units (n_features,) in which each column, or block, has standard deviation 1.
+        """Compute units (n_features,) in which columns, or blocks, have standard deviation 1.
 
         A constant column takes the mean variance of its block, or 1 where that is zero too.
 
@@ -183,3 +180,12 @@ class ColumnMoments:
         blocks = np.split(variance, np.cumsum(widths)[:-1])
         common = np.repeat([block.mean() or 1.0 for block in blocks], list(widths))
         return np.sqrt(common if isotropic else np.where(variance == 0, common, variance))
+
+
+def _count_rows(rows: Rows, processes: Processes) -> int:
+    """Count the rows of all processes, which have some each, and the same columns."""
+    counts, widths = zip(*processes.gather(rows.shape), strict=True)
+    processes.check_share(counts, "row")
+    if len(set(widths)) > 1:
+        raise DataError(f"the processes' rows have {widths} columns: all need the same")
+    return sum(counts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,9 +11,8 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.mixture.processes import ALONE, Processes
 
-__all__ = ["DemonstratedPeaks", "demonstrated_peaks"]
+__all__ = ["demonstrated_peaks", "joint_peaks", "typical_peaks"]
 
 #: Width of the windows in which polynomials are fitted [s], and in instants.
 WINDOW, FEWEST = 0.25, 9
@@ -21,46 +20,10 @@ WINDOW, FEWEST = 0.25, 9
 DEMONSTRATIONS = 0.9
 
 
-class DemonstratedPeaks:
-    """Peaks of demonstrations that come by, batch by batch.
-
-    Parameters
-    ----------
-    joint_names : sequence of str
-        The joints, in their order.
-    """
-
-    def __init__(self, joint_names: Sequence[str]) -> None:
-        self._names, self._peaks = tuple(joint_names), list[Array]()
-
-    def watch(
-        self, batches: Iterable[Sequence[Demonstration]]
-    ) -> Iterator[Sequence[Demonstration]]:
-        """The same batches, looked at as they are passed on."""
-        for batch in batches:
-            self._peaks += [
-                _peaks(demonstration.reordered(self._names)) for demonstration in batch
-            ]
-            yield batch
-
-    def result(self, processes: Processes = ALONE) -> tuple[Tensor, Tensor]:
-        """Acceleration and jerk that few demonstrations exceed, of those of all processes.
-
-        Returns
-        -------
-        acceleration : Tensor of shape (n_joints,)
-        jerk : Tensor of shape (n_joints,)
-            [rad/s^2], [rad/s^3], or m.
-        """
-        peaks = [one for part in processes.gather(self._peaks) for one in part]
-        found = np.quantile(np.stack(peaks), DEMONSTRATIONS, axis=0)
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
-
-
 def demonstrated_peaks(
     demonstrations: Sequence[Demonstration], joint_names: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Peaks of acceleration and jerk of each joint.
+    """Compute peaks of acceleration and jerk of each joint.
 
     Second and third derivatives of recorded positions are mostly noise. They are taken from
     cubic polynomials in windows of 0.25 s (Savitzky and Golay, 1964); a tenth of the
@@ -69,6 +32,7 @@ def demonstrated_peaks(
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of the joints named.
     joint_names : sequence of str
         The joints, in their order.
 
@@ -86,14 +50,23 @@ def demonstrated_peaks(
     >>> round(float(acceleration), 1), round(float(jerk), 1)
     (4.0, 8.0)
     """
-    peaks = DemonstratedPeaks(joint_names)
-    for _ in peaks.watch([demonstrations]):
-        pass
-    return peaks.result()
+    return typical_peaks([joint_peaks(one.reorder(joint_names)) for one in demonstrations])
 
 
-def _peaks(demonstration: Demonstration) -> Array:
-    """Acceleration and jerk, (2, n_joints)."""
+def typical_peaks(peaks: Sequence[Array]) -> tuple[Tensor, Tensor]:
+    """Compute the acceleration and jerk that few of the demonstrations exceed.
+
+    Parameters
+    ----------
+    peaks : sequence of array of shape (2, n_joints)
+        :func:`joint_peaks` of each demonstration.
+    """
+    acceleration, jerk = np.quantile(np.stack(peaks), DEMONSTRATIONS, axis=0)
+    return torch.from_numpy(acceleration), torch.from_numpy(jerk)
+
+
+def joint_peaks(demonstration: Demonstration) -> Array:
+    """Compute peaks (2, n_joints) of acceleration and jerk of one ``demonstration``."""
     time, joints = as_array(demonstration.time), as_array(demonstration.joints)
     if len(time) < FEWEST:
         return np.zeros((2, joints.shape[1]))

@@ -9,14 +9,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.arrays import Array, as_array, as_tensor
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, MissingLimitsWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -32,36 +30,8 @@ RISE_TIME, RISE_TIME_ALONE = 0.25, 0.1
 BELIEVABLE_SPEED = 4.0
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
-#: Share of a bound that rounding may add to it, and what it makes of the acceleration of a
-#: joint at constant speed [rad/s^2 or m/s^2].
+#: What rounding makes of the acceleration of a joint at constant speed [rad/s^2 or m/s^2].
 ROUNDING = 1e-9
-#: In place of an infinite bound where numbers have to be finite.
-ENDLESS = 1e9
-
-
-class LimitArrays(NamedTuple):
-    """Bounds as arrays of shape (n_joints,), and what every tick asks of them.
-
-    Parameters
-    ----------
-    lower, upper, velocity, acceleration, jerk : ndarray
-        The bounds, with room for rounding in the acceleration and the jerk.
-    half_over_jerk : ndarray
-        ``1 / 2J``: an acceleration a that is given up as fast as can be adds ``a^2 / 2J`` to
-        the speed.
-    stopping_time, stopping_distance : ndarray
-        A motion that reaches the speed v at most is stopped within
-        ``v * stopping_time + stopping_distance``.
-    """
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-    half_over_jerk: Array
-    stopping_time: Array
-    stopping_distance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +54,7 @@ class MotionBounds:
 
     Examples
     --------
-    >>> from tpgmm_torch.robots.joint_space import JointSpace
+    >>> from tpgmm_torch.robots.kinematics import JointSpace
     >>> bounds = MotionBounds.of(JointSpace(["a", "b"]), velocity=2.0, acceleration={"b": 8.0})
     >>> bounds.acceleration.tolist()
     [20.0, 8.0]
@@ -112,7 +82,7 @@ class MotionBounds:
     def of(
         cls, kinematics: Any, demonstrated: tuple[Tensor, Tensor] | None = None, **given: Any
     ) -> Self:
-        """Bounds of a robot, of what was demonstrated, and of the user.
+        """Choose the bounds of a robot, of what was demonstrated, and of the user.
 
         Accelerations and jerks that neither the user nor the description of the robot gives
         are three times those demonstrated, and let every joint reach its speed limit in
@@ -123,6 +93,7 @@ class MotionBounds:
         Parameters
         ----------
         kinematics : Kinematics or Skill
+            Whose limits hold, or a skill, whose peaks count too.
         demonstrated : tuple of two Tensor of shape (n_joints,), optional
             Peaks of acceleration and jerk, of
             :func:`~tpgmm_torch.motion.demonstrated_peaks.demonstrated_peaks`.
@@ -146,50 +117,29 @@ class MotionBounds:
             demonstrated = demonstrated or kinematics.peaks
             kinematics = kinematics.kinematics
         names = [field.name for field in fields(cls)]
-        if unknown := [name for name in given if name not in names]:
-            raise UnknownNameError("bound", unknown[0], "the bounds of a motion", names)
-        bound = {name: _tightened(name, kinematics, given.get(name)) for name in names}
-        if bound["velocity"].isfinite().any():
-            _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
-        bound |= _completed(bound, demonstrated)
+        for name in given.keys() - {*names}:
+            raise UnknownNameError("bound", name, "the bounds of a motion", names)
+        bound = {name: _tighten_bound(name, kinematics, given.get(name)) for name in names}
+        _warn_of_missing_limits(kinematics, bound, given)
+        bound |= _complete_rates(bound, demonstrated)
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
 
-    @cached_property
-    def arrays(self) -> LimitArrays:
-        """The same as arrays, and constants of stopping."""
-        values = (getattr(self, field.name) for field in fields(self))
-        lower, upper, velocity, acceleration, jerk = map(as_array, values)
-        with np.errstate(invalid="ignore", over="ignore"):
-            ramp = np.where(np.isinf(jerk), 0.0, acceleration / jerk)
-            brake = np.where(np.isinf(acceleration), 0.0, velocity / (2 * acceleration))
-            distance = acceleration * ramp * ramp / 3
-            stopping = 1.5 * ramp + brake
-        # nothing is in the way of a joint without limits of position; infinite times a speed
-        # of 0 would be no number
-        bounded = np.isfinite(lower) | np.isfinite(upper)
-        stopping, distance = (
-            np.where(bounded, np.nan_to_num(x, nan=ENDLESS, posinf=ENDLESS), 0.0)
-            for x in (stopping, distance)
-        )
-        room = 1 + ROUNDING
-        return LimitArrays(
-            lower, upper, velocity, acceleration * room, jerk * room, 0.5 / jerk, stopping,
-            distance,
-        )  # fmt: skip
 
-
-def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None:
+def _warn_of_missing_limits(
+    kinematics: Kinematics, bound: Mapping[str, Tensor], given: Mapping[str, Any]
+) -> None:
     """Warn of joints of which neither the robot nor the user gives position and speed."""
-    known = kinematics.lower.isfinite() & False
-    if given:
-        known = torch.stack([bound.isfinite() for bound in given]).all(0)
+    chosen = [bound[name] for name in ("lower", "upper", "velocity") if name in given]
+    known = torch.zeros_like(bound["lower"], dtype=torch.bool)
+    if chosen:
+        known = torch.stack(chosen).isfinite().all(0)
     lacking = set(kinematics.without_limits).difference(kinematics.doubtful)
     missing = [
         name
         for name, there in zip(kinematics.joint_names, known, strict=True)
         if name in lacking and not there
     ]
-    if missing:
+    if missing and bound["velocity"].isfinite().any():
         warnings.warn(
             "the description of the robot has no limits of position or speed, or none that fit "
             f"together, of the joints {missing}: complete the URDF, or give lower, upper and "
@@ -199,10 +149,10 @@ def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None
         )
 
 
-def _completed(
+def _complete_rates(
     bound: Mapping[str, Tensor], demonstrated: tuple[Tensor, Tensor] | None
 ) -> dict[str, Tensor]:
-    """Acceleration and jerk, also where they are infinite: of no robot and no user."""
+    """Complete acceleration and jerk where they are infinite: of no robot and no user."""
     velocity, acceleration, jerk = (bound[n] for n in ("velocity", "acceleration", "jerk"))
     seconds, shown = RISE_TIME_ALONE, [torch.zeros_like(velocity)] * 2
     if demonstrated is not None:
@@ -224,32 +174,32 @@ def _completed(
     return {"acceleration": acceleration, "jerk": torch.where(jerk.isfinite(), jerk, usual)}
 
 
-def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
-    """The robot's own bound and the user's."""
-    own, joints = getattr(kinematics, name), kinematics.joint_names
-    if own is None:
-        own = torch.full_like(kinematics.lower, torch.inf)
-    own = own.double().clone()  # a file does not share them
+def _tighten_bound(name: str, kinematics: Kinematics, given: Any) -> Tensor:
+    """Tighten the robot's own bound by the user's."""
+    limit, joints = getattr(kinematics, name), kinematics.joint_names
+    if limit is None:
+        limit = torch.full_like(kinematics.lower, torch.inf)
+    limit = limit.double().clone()  # a file does not share them
     if given is None:
-        return own
+        return limit
     if isinstance(given, Mapping):
-        values = own.clone()
+        values = limit.clone()
         for joint, value in given.items():
             if joint not in joints:
                 raise UnknownNameError("joint", joint, "the robot", joints)
             values[joints.index(joint)] = as_tensor(value, f"{name} of {joint!r}")
     else:
-        values = as_tensor(given, name).to(own)
-        if values.shape not in ((), own.shape):
+        values = as_tensor(given, name).to(limit)
+        if values.shape not in ((), limit.shape):
             raise ShapeError(
                 f"{name} is one number or one for each of the {len(joints)} joints, got shape "
                 f"{tuple(values.shape)}"
             )
-        values = values.expand_as(own)
-    wider = values < own if name == "lower" else values > own
+        values = values.expand_as(limit)
+    wider = values < limit if name == "lower" else values > limit
     if bool(wider.any()):
         which = wider.nonzero()[:, 0].tolist()
-        listed = [f"{joints[i]} {values[i]:g} (robot: {own[i]:g})" for i in which]
+        listed = [f"{joints[i]} {values[i]:g} (robot: {limit[i]:g})" for i in which]
         raise DataError(
             f"{name} is wider than the robot's own limit: {', '.join(listed)}; give a tighter "
             "one, or correct the description of the robot"

@@ -15,7 +15,7 @@ __all__ = ["chain_to_urdf"]
 
 
 def chain_to_urdf(chain: Any) -> str:
-    """The text of a URDF that moves as a chain of pytorch_kinematics does.
+    """Write a URDF that moves as a chain of pytorch_kinematics does.
 
     Parameters
     ----------
@@ -62,6 +62,6 @@ def _unit(axis: Any) -> Array:
 
 
 def _ends(limits: Any) -> tuple[float, float]:
-    """A range; None for a single point, which readers make of a range that is not given."""
+    """Read a range, unlimited for a single point, which readers make of one not given."""
     lower, upper = (-math.inf, math.inf) if limits is None else map(float, limits)
     return (lower, upper) if lower < upper else (-math.inf, math.inf)

@@ -60,7 +60,7 @@ class TreeKinematics:
         parents += [len(bodies) + parent for parent in parents]
         # each matrix's ancestor of degree 1, 2, 4, ...; by level, the matrices and where their
         # carriers stand among those of the level before; and where each comes to stand
-        self._ancestors = [self._index(ancestors) for ancestors in _doubled(parents)]
+        self._ancestors = [self._index(ancestors) for ancestors in _ancestors_by_power(parents)]
         levels = _levels(parents)
         self._levels = [self._index(level) for level in levels]
         self._carriers = [
@@ -102,11 +102,12 @@ class TreeKinematics:
         return torch.tensor([*values], dtype=torch.long, device=self._options["device"])
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Poses and Jacobians in the base frame.
+        """Compute poses and Jacobians in the base frame.
 
         Parameters
         ----------
         joints : Tensor of shape (B, n_joints)
+            Joint vectors [rad or m].
 
         Returns
         -------
@@ -140,7 +141,7 @@ class TreeKinematics:
         return position, quaternion, jacobians
 
     def _products(self, local: Tensor) -> Tensor:
-        """Along the tree, of matrices (B, 2 N, 4, 4) that are each given in its carrier."""
+        """Multiply matrices (B, 2 N, 4, 4), each given in its carrier, along the tree."""
         if len(local) <= FEW or torch.compiler.is_compiling():
             for ancestors in self._ancestors:
                 local = _product(local.index_select(1, ancestors), local)
@@ -152,14 +153,14 @@ class TreeKinematics:
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
-    """``first @ second``; for a compiler a sum: a loop that others can join."""
+    """Compute ``first @ second``; for a compiler as a sum, a loop that others can join."""
     if torch.compiler.is_compiling():
         return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(-2)
     return first @ second
 
 
 def _columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], bool]:
-    """Which body moves each column of the Jacobians, and whether columns are joints.
+    """Find the body that moves each column of the Jacobians; tell if columns are joints.
 
     The base moves none. Where joints mimic others, several bodies add up to one joint.
     """
@@ -171,7 +172,7 @@ def _columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], 
 
 
 def _motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array]:
-    """How N matrices of poses, and behind them N of turns, depend on the joints.
+    """Tabulate how N matrices of poses, then N of turns, depend on the joints.
 
     Returns
     -------
@@ -195,8 +196,8 @@ def _motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array
     return factors, follow, shift
 
 
-def _doubled(parents: Sequence[int]) -> list[list[int]]:
-    """Whom each matrix is multiplied by: its parent, its ancestor of degree 2, 4, ..."""
+def _ancestors_by_power(parents: Sequence[int]) -> list[list[int]]:
+    """List each matrix's ancestors of degree 1, 2, 4, ..., by degree."""
     hops, ahead = [], list(parents)
     while not set(ahead) <= {0, len(parents) // 2}:  # the base stands still
         hops.append(ahead)
@@ -205,7 +206,7 @@ def _doubled(parents: Sequence[int]) -> list[list[int]]:
 
 
 def _levels(parents: Sequence[int]) -> list[list[int]]:
-    """The nodes of a forest by their depth."""
+    """Sort the nodes of a forest by their depth."""
     levels = [[node for node, parent in enumerate(parents) if node == parent]]
     while below := [
         node for node, parent in enumerate(parents) if parent in levels[-1] and node != parent

@@ -22,7 +22,7 @@ def held_objects(
     *,
     attached: bool = False,
 ) -> tuple[RobotState, dict[str, Frame]]:
-    """Objects that were held as links of the state, and as the places where they were free.
+    """Add objects that were held as links, and find the places where they were free.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def held_objects(
                 # from hand to hand it is not free between
                 last_free[begin:end] = last_free[begin - 1] if begin == free else begin
                 free = end
-                pose = pose if recorded else _carried(state, pose, hold.link, begin, end)
+                pose = pose if recorded else _carry_object(state, pose, hold.link, begin, end)
                 held.append((hold.link, (instants >= begin) & (instants < end)))
         state = state.with_link(name, None, pose)
         for link, where in held if attached else ():
@@ -69,8 +69,8 @@ def held_objects(
     return state, places
 
 
-def _carried(state: RobotState, pose: Frame, link: str, begin: int, end: int) -> Frame:
-    """Poses (T,) of what a link carries between two instants, and leaves where it is then."""
+def _carry_object(state: RobotState, pose: Frame, link: str, begin: int, end: int) -> Frame:
+    """Compute poses (T,) of what a link carries between two instants, then leaves."""
     hand = state.pose(link)
     grasp = pose[begin].seen_from(hand[begin])
     instants = torch.arange(len(hand.position), device=hand.position.device)

@@ -88,7 +88,7 @@ def reduce(
         for far in reversed(way[:-1]):
             joint, near = steps[far]
             carrier, pose = places[near]
-            before, axis, after = _crossing(joint, near)
+            before, axis, after = _joint_transform(joint, near)
             leader = model.leader(joint.name) if joint.movable else None
             if leader and leader.joint in joints:
                 turn = _z_to(axis)
@@ -97,14 +97,14 @@ def reduce(
                 bodies.append(Body(carrier, pose @ before @ turn, *follow))
                 places[far] = len(bodies) - 1, turn.T @ after
             else:
-                at = _standing(leader, locked, link) if leader else 0.0
+                at = _locked_position(leader, locked, link) if leader else 0.0
                 places[far] = carrier, pose @ before @ motion(joint.type, axis, at) @ after
     ends = [(places[link], pose) for link, pose in links]
     return (*bodies, *(Body(carrier, place @ pose) for (carrier, place), pose in ends))
 
 
-def _standing(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
-    """Where a joint stands that is not in the joint vector."""
+def _locked_position(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
+    """Return the position of a joint that is not in the joint vector."""
     if leader.joint not in locked:
         raise DataError(
             f"joint {leader.joint!r} moves link {link!r}: it is measured in radians (or "
@@ -114,7 +114,7 @@ def _standing(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
 
 
 def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:
-    """The last step from the base to each other link: the joint, and the link before it."""
+    """Find the last step from the base to each link: a joint, and the link before it."""
     above = {joint.child: joint for joint in model.joints}
     steps = {child: (joint, joint.parent) for child, joint in above.items()}
     steps.pop(base, None)
@@ -126,8 +126,8 @@ def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]
     return steps
 
 
-def _crossing(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
-    """From the near link of a joint to the far one: a pose, the axis of a motion, a pose."""
+def _joint_transform(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
+    """Cross a joint from its near link to the far one: a pose, the axis, a pose."""
     if FREEDOMS[joint.type] > 1:
         raise DataError(
             f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
@@ -141,7 +141,7 @@ def _crossing(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
 
 
 def _z_to(axis: Array) -> Array:
-    """A rotation that takes the z axis to a unit vector, as a homogeneous matrix."""
+    """Rotate the z axis to a unit vector: a homogeneous matrix."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     matrix = np.eye(4)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import copy
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -20,15 +20,14 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
-__all__ = ["Described", "Kinematics", "RobotState", "checked_dtype"]
+__all__ = ["Described", "JointSpace", "Kinematics", "RobotState", "parse_dtype"]
 
 
-def checked_dtype(dtype: Any) -> torch.dtype:
-    """The ``dtype`` of a robot, also given by its name, ``"float32"`` or ``"float64"``.
+def parse_dtype(dtype: Any) -> torch.dtype:
+    """Parse the ``dtype`` of a robot, also a name, ``"float32"`` or ``"float64"``.
 
     Raises
     ------
@@ -87,45 +86,46 @@ class RobotState:
         return self.links[: len(self.links) - len(self.carriers)]
 
     def position(self, link: str) -> Tensor:
-        """``x_{t-1}`` of a link [m], shape (..., 3)."""
+        """Return ``x_{t-1}`` of a link [m], shape (..., 3)."""
         return self.positions[..., self._index(link), :]
 
     def orientation(self, link: str) -> Tensor:
-        """``eps_{t-1}`` of a link, unit quaternion of shape (..., 4)."""
+        """Return ``eps_{t-1}`` of a link, unit quaternion of shape (..., 4)."""
         return self.orientations[..., self._index(link), :]
 
     def pose(self, link: str) -> Frame:
-        """Position and orientation of a link."""
+        """Return position and orientation of a link."""
         return Frame.from_checked(self.position(link), self.orientation(link))
 
     def jacobian(self, link: str) -> Tensor:
-        """``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""
+        """Return ``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""
         return self.jacobians[..., self._index(link), :, :]
 
     def linear_jacobian(self, link: str) -> Tensor:
-        """``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
+        """Return ``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
         return self.jacobian(link)[..., :3, :]
 
     def angular_jacobian(self, link: str) -> Tensor:
-        """``J_o`` of a link: angular velocity per joint velocity, shape (..., 3, n_joints)."""
+        """Return ``J_o`` of a link: angular velocity per joint velocity, (..., 3, n_joints)."""
         return self.jacobian(link)[..., 3:, :]
 
     def quaternion_columns(self, link: str) -> slice | None:
-        """Where the quaternion of a link is in the joint vector: nowhere, on a robot."""
+        """Locate a link's quaternion in the joint vector: nowhere, on a robot."""
         return None
 
     def carrier(self, link: str) -> int | Tensor:
-        """The index of the robot's link that a link is, or that carries it; -1 if none does."""
+        """Return the index of the robot's link that a link is, or that carries it; else -1."""
         index = self._index(link)
         n_robot = len(self.links) - len(self.carriers)
         return index if index < n_robot else self.carriers[index - n_robot]
 
-    def displaced(self, link: str, step: Tensor) -> Self:
-        """The state with a link taken to be elsewhere, with the same orientation and Jacobian.
+    def displace_link(self, link: str, step: Tensor) -> Self:
+        """Move a link elsewhere, with the same orientation and Jacobian.
 
         Parameters
         ----------
         link : str
+            Name of the link that is moved.
         step : Tensor of shape (..., 3)
             From where it is, in the base frame [m].
         """
@@ -135,7 +135,7 @@ class RobotState:
     def with_link(
         self, name: str, link: str | None, pose: Frame, where: Tensor | None = None
     ) -> Self:
-        """The state with an object as a link of its own, which a link of the robot carries.
+        """Add an object as a link of its own, which a link of the robot carries.
 
         With ``r = R_l p`` from the origin of the link to the object, this is at ``x_l + r``
         and moves with ``J_p + J_o x r``, ``J_o``.
@@ -199,7 +199,7 @@ class RobotState:
         carriers = *(self.carriers[i - first] for i in kept[first:]), carrier
         batch = common_shape(self.joints.shape[:-1], position.shape[:-1])
 
-        def joined(links: Tensor, new: Tensor, rank: int) -> Tensor:
+        def append_object(links: Tensor, new: Tensor, rank: int) -> Tensor:
             shape = *batch, *new.shape[new.ndim - rank :]
             old = (links.select(-1 - rank, i).expand(shape) for i in kept)
             return torch.stack((*old, new.expand(shape)), -1 - rank)
@@ -208,14 +208,14 @@ class RobotState:
             self,
             joints=self.joints.expand(*batch, -1),
             links=(*(self.links[i] for i in kept), name),
-            positions=joined(self.positions, position, 1),
-            orientations=joined(self.orientations, orientation, 1),
-            jacobians=joined(self.jacobians, jacobian, 2),
-            carriers=tuple(_expanded(one, batch) for one in carriers),
+            positions=append_object(self.positions, position, 1),
+            orientations=append_object(self.orientations, orientation, 1),
+            jacobians=append_object(self.jacobians, jacobian, 2),
+            carriers=tuple(_expand(one, batch) for one in carriers),
         )
 
     def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
-        """The state with each of its tensors changed, given the rank behind the batch."""
+        """Change each of the tensors, given the rank behind the batch."""
         return replace(
             self,
             joints=change(self.joints, 1),
@@ -229,7 +229,7 @@ class RobotState:
         )
 
     def flatten(self, batch: torch.Size) -> Self:
-        """The states of a whole batch, its dimensions as one."""
+        """Flatten the dimensions of a whole batch into one."""
         last = len(batch) - 1
 
         def whole(part: Tensor, rank: int) -> Tensor:
@@ -247,7 +247,7 @@ class RobotState:
         return self.links.index(link)
 
 
-def _expanded(carrier: int | Tensor, batch: torch.Size) -> int | Tensor:
+def _expand(carrier: int | Tensor, batch: torch.Size) -> int | Tensor:
     return carrier.expand(batch) if isinstance(carrier, Tensor) else carrier
 
 
@@ -315,26 +315,6 @@ class Kinematics(abc.ABC):
         """Number of coordinates of the joint vector."""
         return len(self.joint_names)
 
-    def gripping(self) -> Tensor | None:
-        """Joints that close around things: named as grippers, and no link moves with them.
-
-        One that holds something does not come to its reference: where it stands says nothing
-        of whether the robot follows.
-
-        Returns
-        -------
-        Tensor of bool, shape (n_joints,)
-            None if there is no such joint, or no other one.
-        """
-        named = torch.tensor([is_gripper(name) for name in self.joint_names])
-        if not named.any() or named.all():
-            return None
-        somewhere = torch.clamp(torch.zeros_like(self.lower), self.lower, self.upper)
-        moved = self.state(somewhere).jacobians.abs() > 0
-        free = ~moved.flatten(end_dim=-2).any(0) if self.links else torch.ones_like(named)
-        found = named.to(free.device) & free
-        return found if bool(found.any()) else None
-
     @abc.abstractmethod
     def state(self, joints: Any) -> RobotState:
         """Run the kinematics at ``joints``, array-like of shape (..., n_joints).
@@ -383,7 +363,7 @@ class Kinematics(abc.ABC):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """The same kinematics in another dtype or on another device; itself if none changes."""
+        """Convert to another dtype or device; itself if none changes."""
         other = copy.copy(self)
         for name in {*vars(self), "lower", "upper", "velocity"}:
             value = getattr(self, name)
@@ -402,7 +382,7 @@ class Described(Kinematics):
     _config: dict[str, Any]
 
     def config(self) -> dict[str, Any]:
-        """Arguments of ``from_config``, ready for JSON."""
+        """Return arguments of ``from_config``, ready for JSON."""
         return copy.deepcopy(self._config)
 
     @classmethod
@@ -418,3 +398,37 @@ class Described(Kinematics):
 
     def __hash__(self) -> int:
         return hash((type(self), json.dumps(self._config, sort_keys=True)))
+
+
+class JointSpace(Described):
+    """Joints of those ``joint_names`` and nothing else: enough for :class:`Canonical` alone.
+
+    ``dtype`` and ``device`` are those of its states.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.joint_names = tuple(joint_names)
+        self._config = {"joint_names": list(self.joint_names)}
+        self.links = ()
+        unbounded = torch.full((len(self.joint_names),), torch.inf, dtype=dtype, device=device)
+        self.lower, self.upper, self.velocity = -unbounded, unbounded, unbounded
+
+    def state(self, joints: Any) -> RobotState:
+        """Return the state with no link in it; see :meth:`Kinematics.state`."""
+        joints = self.joint_tensor(joints)
+        shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
+        p, o, jacobians = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
+        return RobotState(joints, (), p, o, jacobians, (), self.joint_names)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Invert ``config``."""
+        return cls(config["joint_names"])
+
+    def __repr__(self) -> str:
+        return f"JointSpace({len(self.joint_names)} joints)"

@@ -16,7 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
@@ -41,7 +41,7 @@ HOW_TO_INSTALL = "pip install 'tpgmm-torch[simulation]'"
 
 
 def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
-    """The text of a URDF that moves as an MJCF does.
+    """Write a URDF that moves as an MJCF does.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
     """
     if (tag := parse_xml(description_text(mjcf)).tag) != "mujoco":
         raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
-    return _Translation(compiled(mjcf, "the MJCF")).text()
+    return _Translation(compile_mjcf(mjcf, "the MJCF")).text()
 
 
 def mujoco_module(purpose: str) -> Any:
-    """MuJoCo, or a DependencyError that says what it is needed for and how to install it."""
+    """Import MuJoCo, or raise an error that says what needs it and how to install it."""
     try:
         import mujoco
     except ImportError as error:
@@ -79,8 +79,8 @@ def mujoco_module(purpose: str) -> Any:
     return mujoco
 
 
-def compiled(mjcf: str | os.PathLike[str], what: str) -> Any:
-    """The compiled model of an MJCF, a path or the text itself, that errors call ``what``."""
+def compile_mjcf(mjcf: str | os.PathLike[str], what: str) -> Any:
+    """Compile an MJCF, a path or the text itself, that errors call ``what``."""
     mujoco = mujoco_module(f"compiling {what}")
     try:
         if is_text(mjcf):
@@ -134,8 +134,8 @@ class _Translation:
             anchor = model.jnt_pos[joint] if is_hinge else np.zeros(3)
             is_last = joint == end - 1 and not anchor.any()
             far = link if is_last else self._free(f"{link}/{self.joint_names[joint]}")
-            one = self._joint(joint, near, far, before @ _pose(anchor))
-            self.joints.append(replace(one, mimic=mimics.get(joint)))
+            urdf_joint = self._joint(joint, near, far, before @ _pose(anchor))
+            self.joints.append(replace(urdf_joint, mimic=mimics.get(joint)))
             near, before = far, _pose(-anchor)
         if near != link:
             moved_from_outside = model.body_mocapid[body] >= 0
@@ -154,41 +154,51 @@ class _Translation:
         return UrdfJoint(name, motion_of, near, far, start, axis, lower, upper, velocity)
 
     def _limits(self, joint: int) -> tuple[float, float, float]:
-        """Lower, upper and velocity: of the joint, and of the servos that drive it.
+        """Compute lower, upper and velocity: of the joint, and of the servos that drive it.
 
         The force of a servo is ``gain * control + bias . (1, l, l')`` with the length ``l``,
         ``gear * q``: it is in balance where that is zero.
         """
-        model, mujoco = self.model, self.mujoco
+        model = self.model
         lower, upper, velocity = -math.inf, math.inf, math.inf
         if model.jnt_limited[joint]:
             lower, upper = map(float, model.jnt_range[joint])
+        for servo in self._servos(joint):
+            low, high, speed = self._servo_limits(servo)
+            velocity = min(velocity, speed)
+            if max(low, lower) < min(high, upper):
+                lower, upper = max(low, lower), min(high, upper)
+        return lower, upper, velocity
+
+    def _servos(self, joint: int) -> NDArray[np.intp]:
+        """Find the actuators that drive a joint directly, against a force of its own."""
+        model, mujoco = self.model, self.mujoco
         direct = [mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT]
         is_servo = np.isin(model.actuator_trntype, direct) & (model.actuator_gear[:, 0] != 0)
         is_servo &= model.actuator_trnid[:, 0] == joint
         is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-        for servo in np.flatnonzero(is_servo):
-            constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
-            gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
-            commands = model.actuator_ctrlrange[servo]
-            limited = model.actuator_ctrllimited[servo]
-            if model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
-                if stiffness and limited:  # the control is the speed of what is commanded
-                    speeds = gain * commands / (stiffness * gear)
-                    velocity = min(velocity, float(np.abs(speeds).max()))
-                commands = model.actuator_actrange[servo]
-                limited = model.actuator_actlimited[servo]
-            ends = -(gain * commands + constant) / gear
-            if limited and stiffness:
-                low, high = sorted(map(float, ends / stiffness))
-                if max(low, lower) < min(high, upper):
-                    lower, upper = max(low, lower), min(high, upper)
-            elif limited and damping:
-                velocity = min(velocity, float(np.abs(ends / damping).max()))
-        return lower, upper, velocity
+        return np.flatnonzero(is_servo)
+
+    def _servo_limits(self, servo: int) -> tuple[float, float, float]:
+        """Compute lower, upper and velocity of one servo."""
+        model = self.model
+        low, high, velocity = -math.inf, math.inf, math.inf
+        constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
+        gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
+        commands, limited = model.actuator_ctrlrange[servo], model.actuator_ctrllimited[servo]
+        if model.actuator_dyntype[servo] == self.mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            if stiffness and limited:  # the control is the speed of what is commanded
+                velocity = float(np.abs(gain * commands / (stiffness * gear)).max())
+            commands, limited = model.actuator_actrange[servo], model.actuator_actlimited[servo]
+        ends = -(gain * commands + constant) / gear
+        if limited and stiffness:
+            low, high = sorted(map(float, ends / stiffness))
+        elif limited and damping:
+            velocity = min(velocity, float(np.abs(ends / damping).max()))
+        return low, high, velocity
 
     def _mimics(self) -> dict[int, Mimic]:
-        """Joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by active equalities."""
+        """Find joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by equalities."""
         model = self.model
         mimics: dict[int, Mimic] = {}
         is_joint = model.eq_type == self.mujoco.mjtEq.mjEQ_JOINT
@@ -196,13 +206,13 @@ class _Translation:
         for index in np.flatnonzero(is_joint & is_line & (model.eq_active0 != 0)):
             joint, leader = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
             constant, slope = map(float, model.eq_data[index, :2])
-            own, other = (model.qpos0[model.jnt_qposadr[j]] for j in (joint, leader))
-            offset = float(own + constant - slope * other)
+            zero, leader_zero = (model.qpos0[model.jnt_qposadr[j]] for j in (joint, leader))
+            offset = float(zero + constant - slope * leader_zero)
             mimics.setdefault(joint, Mimic(self.joint_names[leader], slope, offset))
         return mimics
 
     def _visuals(self) -> dict[str, list[ElementTree.Element]]:
-        """Visual geometry of links: the solids of URDF, without ellipsoids and planes."""
+        """Convert visual geometry of links: the solids of URDF."""
         visuals: dict[str, list[ElementTree.Element]] = {link: [] for link in self.links}
         shown_groups = self.mujoco.MjvOption().geomgroup  # MuJoCo's own; others collide
         for geom in map(self.model.geom, range(self.model.ngeom)):
@@ -245,7 +255,7 @@ class _Translation:
 
 
 def _names(element: Any, count: int, kind: str) -> list[str]:
-    """The names of all bodies or joints; those without one are called by their number."""
+    """Return the names of all bodies or joints, or their numbers."""
     given = [element(index).name for index in range(count)]
     return [name or free_name(f"{kind}{i}", given) for i, name in enumerate(given)]
 

@@ -24,9 +24,10 @@ from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, U
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
-from tpgmm_torch.robots.kinematics import Described, Kinematics, RobotState, checked_dtype
+from tpgmm_torch.robots.kinematics import Described, Kinematics, RobotState, parse_dtype
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 from tpgmm_torch.robots.urdf import (
+    LIMITS,
     X_AXIS,
     UrdfJoint,
     UrdfModel,
@@ -202,7 +203,7 @@ class Robot(Described):
     def from_file(
         cls, description: str | os.PathLike[str], links: Sequence[str], **settings: Any
     ) -> Self:
-        """The robot of a URDF or an MJCF, whichever the outermost element says it is.
+        """Read a URDF or an MJCF, whichever the outermost element says it is.
 
         Parameters
         ----------
@@ -225,7 +226,7 @@ class Robot(Described):
         base: str = "world",
         **robots: Robot,
     ) -> Self:
-        """Several robots side by side as one: two arms on a table are one bimanual robot.
+        """Combine robots side by side: two arms on a table are one bimanual robot.
 
         Parameters
         ----------
@@ -283,7 +284,7 @@ class Robot(Described):
         options |= {"base": base, "dtype": first.dtype, "device": first.device}
         with warnings.catch_warnings():  # each has told its own doubts
             warnings.simplefilter("ignore", PlausibilityWarning)
-            return cls.from_urdf(_mounted(robots, roots, fixed), **options)
+            return cls.from_urdf(_merge_urdfs(robots, roots, fixed), **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -293,14 +294,14 @@ class Robot(Described):
         self.model = model
         self.joint_names = tuple(config["joints"])
         self.links = tuple(config["links"])
-        own = model.joint.keys() - config["coordinates"]
-        column = {name: i for i, name in enumerate(self.joint_names) if name in own}
+        moving = model.joint.keys() - config["coordinates"]
+        column = {name: i for i, name in enumerate(self.joint_names) if name in moving}
         self.lengths = tuple(
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
         self.angles = tuple(i for i in column.values() if i not in self.lengths)
         #: Bodies that move the links with respect to the base, these last; see ``reduce``.
-        self.tree = reduce(model, *_wanted(model, config), column, config["locked"])
+        self.tree = reduce(model, *_select_links(model, config), column, config["locked"])
         between = len(self.tree) - len(self.links) - 1
         if max(self.n_joints, between) > MOST_JOINTS:
             raise DataError(
@@ -308,7 +309,7 @@ class Robot(Described):
                 f"links; more than {MOST_JOINTS} are not supported: choose some, "
                 "joints=[...], or lock some, locked={...}"
             )
-        options: dict[str, Any] = {"dtype": checked_dtype(config["dtype"]), "device": device}
+        options: dict[str, Any] = {"dtype": parse_dtype(config["dtype"]), "device": device}
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
@@ -340,7 +341,7 @@ class Robot(Described):
         return self
 
     def state(self, joints: Any) -> RobotState:
-        """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
+        """Compute poses and Jacobians of all links at ``joints`` (..., n_joints).
 
         Raises
         ------
@@ -363,7 +364,7 @@ class Robot(Described):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """The robot of another dtype or on another device; itself if nothing changes."""
+        """Convert to another dtype or device; itself if nothing changes."""
         name = str(dtype or self.lower.dtype).removeprefix("torch.")
         device = self.lower.device if device is None else torch.device(device)
         if name == self._config["dtype"] and device == self.lower.device:
@@ -372,16 +373,16 @@ class Robot(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
-        """The robot that gave this ``config``."""
+        """Make the robot that gave this ``config``."""
         places = "urdf", "links", "base", "tools"
         cls._check_keys(config, *places, "joints", "locked", "coordinates", "dtype")
         if not isinstance(config["urdf"], str) or not config["urdf"].startswith("<"):
             raise DataError("a robot's configuration holds the text of its URDF, not a path")
-        dtype = checked_dtype(config["dtype"])
+        dtype = parse_dtype(config["dtype"])
         return cls.from_urdf(**{**config, "dtype": dtype, "device": device})
 
-    def unlimited(self, names: Collection[str]) -> Self:
-        """The robot with some joints as coordinates: without limits, in any unit ("raw").
+    def drop_limits(self, names: Collection[str]) -> Self:
+        """Make coordinates of some joints: without limits, in any unit ("raw").
 
         Parameters
         ----------
@@ -418,7 +419,7 @@ class Robot(Described):
             ElementTree.ElementTree(urdf).write(file, "utf-8", xml_declaration=True)
 
     def _root(self) -> Frame:
-        """Where the root of the description is in the frame of the base, which it must hold."""
+        """Locate the root of the description in the frame of the base, which it must hold."""
         config = self._config | {"links": [self.model.root], "dtype": "float64"}
         state = type(self)(self.model, config, "cpu").state(torch.zeros(self.n_joints))
         if state.jacobians.any():
@@ -451,53 +452,62 @@ def _joint_vector(
     coordinates: tuple[str, ...],
     locked: Mapping[str, float],
 ) -> tuple[list[str], dict[str, float]]:
-    """Names of the joint vector, and where all other actuated joints stand."""
-    columns = _fitting(model, _names("joints", joints or ()), coordinates)
-    standing = _fitting(model, locked)
+    """Choose the names of the joint vector, and where all other actuated joints stand."""
+    columns = [*_match_names(model, _names("joints", joints or ()), coordinates)]
+    fixed = _locked_positions(model, locked, columns)
+    if joints is None:
+        columns = [name for name in model.actuated_joints if name not in fixed]
+    columns = [*dict.fromkeys((*columns, *coordinates))]
+    for name in fixed.keys() & {*columns}:
+        raise DataError(f"joint {name!r} is both in the joint vector and locked")
+    still = (name for name in model.actuated_joints if name not in columns)
+    return columns, {name: fixed.get(name, 0.0) for name in still}
+
+
+def _locked_positions(
+    model: UrdfModel, locked: Mapping[str, float], columns: Collection[str]
+) -> dict[str, float]:
+    """Read where joints stand that are named, or fit a pattern and are not in ``columns``."""
+    matches = _match_names(model, locked).items()
     fixed = {
-        name: float(locked[str(given)])
-        for name, given in standing.items()
-        if name == given or name not in columns
+        name: float(locked[key]) for name, key in matches if name == key or name not in columns
     }
     if not all(map(math.isfinite, fixed.values())):
         raise DataError(f"joints are locked at finite numbers, got {dict(locked)}")
-    if joints is None:
-        columns = dict.fromkeys(name for name in model.actuated if name not in fixed)
-    columns |= dict.fromkeys(coordinates)
-    for name in columns.keys() & fixed.keys():
-        raise DataError(f"joint {name!r} is both in the joint vector and locked")
-    still = (name for name in model.actuated if name not in columns)
-    return list(columns), {name: fixed.get(name, 0.0) for name in still}
+    return fixed
 
 
-def _fitting(
+def _match_names(
     model: UrdfModel, names: Collection[str], coordinates: Sequence[str] = ()
-) -> dict[str, str | None]:
-    """The joints or coordinates of some names and patterns, each with what it is named by.
-
-    A pattern stands for the actuated joints that fit it and are not named themselves.
-    """
-    found: dict[str, str | None] = {}
+) -> dict[str, str]:
+    """Find the joints or coordinates of names and patterns, each with what it is named by."""
+    found: dict[str, str] = {}
     for name in names:
-        joint = model.movable.get(name)
-        if joint is not None and joint.mimic is not None:
-            raise DataError(
-                f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
-                f"choose or lock {model.leader(name).joint!r}"
-            )
-        fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
-        if joint is not None or name in coordinates:
-            fits = [name]
-        if not fits:
-            where = "the movable joints of the URDF (a coordinate without kinematics, like a "
-            where += "gripper, is named in coordinates)"
-            raise UnknownNameError("joint", name, where, model.actuated)
+        fits = _match_name(model, name, coordinates)
         found |= {fit: name for fit in fits if fit == name or fit not in {*names, *found}}
     return found
 
 
+def _match_name(model: UrdfModel, name: str, coordinates: Sequence[str]) -> list[str]:
+    """Find the joint or coordinate of a name, or the actuated joints that fit a pattern."""
+    joint = model.movable.get(name)
+    if joint is not None and joint.mimic is not None:
+        raise DataError(
+            f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
+            f"choose or lock {model.leader(name).joint!r}"
+        )
+    if joint is not None or name in coordinates:
+        return [name]
+    fits = [joint for joint in model.actuated_joints if fnmatchcase(joint, name)]
+    if not fits:
+        where = "the movable joints of the URDF (a coordinate without kinematics, like a "
+        where += "gripper, is named in coordinates)"
+        raise UnknownNameError("joint", name, where, model.actuated_joints)
+    return fits
+
+
 def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
-    """A tool as plain numbers: parent link, position, quaternion."""
+    """Describe a tool by plain numbers: parent link, position, quaternion."""
     if isinstance(tool, str) or not 2 <= len(tool) <= 3:
         raise DataError(
             f"tool {name!r} is (parent link, Frame) or (parent link, position, quaternion), "
@@ -516,7 +526,7 @@ def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
 
 
 def _pose(name: str, given: Any) -> Frame:
-    """A pose as it is given to ``combine``."""
+    """Read a pose as it is given to ``combine``."""
     if isinstance(given, Frame):
         return given.to(torch.float64)
     values = as_tensor(given, f"the pose of {name!r}").to(torch.float64)
@@ -538,8 +548,10 @@ def _check_bases(places: Mapping[str, Frame]) -> None:
         warnings.warn(f"{told}centimetres?", PlausibilityWarning, stacklevel=3)
 
 
-def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tuple[str, Array]]]:
-    """The base, and for each wanted link a link of the URDF and the pose in it."""
+def _select_links(
+    model: UrdfModel, config: Mapping[str, Any]
+) -> tuple[str, list[tuple[str, Array]]]:
+    """Select the base, and for each link one of the URDF and the pose in it."""
     here = np.eye(4)
     places = {link: (link, here) for link in model.links}
     if config["base"] not in places:
@@ -556,14 +568,14 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
     return config["base"], [places[link] for link in config["links"]]
 
 
-def _mounted(
+def _merge_urdfs(
     robots: Mapping[str, Robot], roots: Mapping[str, Frame], fixed: Iterable[str]
 ) -> str:
-    """The URDF of robots and fixed links, whose roots are somewhere in a world."""
+    """Merge robots and fixed links, whose roots are somewhere in a world."""
     urdf = ElementTree.Element("robot", name=" and ".join(robots))
     urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))
     for name, robot in robots.items():
-        urdf.extend(_prefixed(name, robot))
+        urdf.extend(_prefix_names(name, robot))
     for link, frame in roots.items():
         _mount(urdf, "world", link, frame)
     return ElementTree.tostring(urdf, encoding="unicode")
@@ -575,8 +587,8 @@ def _mount(urdf: ElementTree.Element, parent: str, link: str, pose: Frame) -> No
     urdf.append(joint_element(UrdfJoint(name, "fixed", parent, link, _matrix(pose), X_AXIS)))
 
 
-def _prefixed(prefix: str, robot: Robot) -> list[ElementTree.Element]:
-    """Links, joints and materials of a robot, with a prefix before all their names."""
+def _prefix_names(prefix: str, robot: Robot) -> list[ElementTree.Element]:
+    """Put a prefix before all names of links, joints and materials of a robot."""
     urdf = parse_xml(robot.model.text)
     parts = [part for part in urdf if part.tag in ("link", "joint", "material")]
     for element in itertools.chain.from_iterable(part.iter() for part in parts):
@@ -587,7 +599,7 @@ def _prefixed(prefix: str, robot: Robot) -> list[ElementTree.Element]:
 
 
 def _side_by_side(robots: Mapping[str, Robot]) -> dict[str, Any]:
-    """Settings of robots by name, which stands before the names of what is theirs."""
+    """Join the settings of robots by name, which stands before their names."""
     settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
     settings |= {"locked": {}, "tools": {}}
     for prefix, robot in robots.items():
@@ -601,7 +613,7 @@ def _side_by_side(robots: Mapping[str, Robot]) -> dict[str, Any]:
 
 
 def _matrix(pose: Frame) -> Array:
-    """A constant pose as a homogeneous matrix."""
+    """Convert a constant pose to a homogeneous matrix."""
     if pose.batch_shape != ():
         raise ShapeError(f"expected one constant pose, got {tuple(pose.batch_shape)} of them")
     matrix = np.eye(4)
@@ -611,30 +623,26 @@ def _matrix(pose: Frame) -> Array:
 
 
 def _limits(
-    model: UrdfModel, names: Sequence[str], own: Collection[str]
+    model: UrdfModel, names: Sequence[str], moving: Collection[str]
 ) -> tuple[Tensor, tuple[str, ...]]:
-    """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
+    """Tabulate lower, upper, velocity, acceleration, jerk; list joints that lack a limit.
 
     Joints that mimic another limit it too. Coordinates without kinematics have no limits, and
     lack none.
     """
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
-    without = set()
-    for name in own:
-        joint = model.joint[name]
-        rows[name] = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk]
-        endless = joint.type != "continuous" and math.isinf(joint.upper)
-        if endless or math.isinf(joint.velocity):
-            without.add(name)
-    for joint in model.movable.values():
-        if joint.mimic is not None and not _limit_leader(model, joint, rows, own):
+    rows |= {name: [getattr(model.joint[name], key) for key in LIMITS] for name in moving}
+    without = {name for name in moving if model.joint[name].lacks_limits}
+    followers = [joint for joint in model.movable.values() if joint.mimic is not None]
+    for joint in followers:
+        if not _limit_leader(model, joint, rows, moving):
             without.add(model.leader(joint.name).joint)
     limits = torch.tensor(list(rows.values()), dtype=torch.float64)
-    return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
+    return limits.reshape(-1, 5).T, tuple(sorted(without, key=names.index))
 
 
 def _limit_leader(
-    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]], own: Collection[str]
+    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]], moving: Collection[str]
 ) -> bool:
     """Apply the limits of a joint that mimics another to that other, which moves with it.
 
@@ -642,7 +650,7 @@ def _limit_leader(
     answer is False.
     """
     leader = model.leader(joint.name)
-    if leader.joint not in own or leader.multiplier == 0:
+    if leader.joint not in moving or leader.multiplier == 0:
         return True
     row, factor = rows[leader.joint], leader.multiplier
     rates = joint.velocity, joint.acceleration, joint.jerk

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.robots.kinematics import Described, RobotState, checked_dtype
+from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 
 __all__ = ["Poses", "PosesState"]
 
@@ -26,7 +26,7 @@ class PosesState(RobotState):
     """The poses themselves, see :class:`RobotState`."""
 
     def quaternion_columns(self, link: str) -> slice | None:
-        """Where the quaternion of a body is in the joint vector; nowhere, of an object.
+        """Locate a body's quaternion in the joint vector; nowhere, of an object.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class Poses(Described):
             self._position_rows, self._quaternion_rows = eye[:, :3], eye[:, 3:]  # (L, ., n)
 
     def state(self, joints: Any) -> PosesState:
-        """The poses in ``joints``, array-like of shape (..., n_joints); see ``Kinematics``.
+        """Read the poses in ``joints``, array-like of shape (..., n_joints).
 
         Quaternions need not have unit norm here: ``orientations`` have, ``joints`` are left.
         The angular Jacobian is ``2 Hbar*(conj eps)`` on the quaternion's columns, so that
@@ -127,7 +127,7 @@ class Poses(Described):
 
     @classmethod
     def joints(cls, poses: Mapping[str, Frame], orientation: bool = True) -> Tensor:
-        """The joint vectors (T, n_joints), or (n_joints,), of recorded poses.
+        """Join recorded poses to joint vectors (T, n_joints), or (n_joints,).
 
         Parameters
         ----------
@@ -160,9 +160,9 @@ class Poses(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
-        """The poses that gave this ``config``."""
+        """Make the poses that gave this ``config``."""
         cls._check_keys(config, "links", "orientation", "dtype")
-        dtype = checked_dtype(config["dtype"])
+        dtype = parse_dtype(config["dtype"])
         return cls(config["links"], config["orientation"], dtype, device)
 
     def __repr__(self) -> str:

@@ -25,23 +25,13 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
 __all__ = [
-    "Mimic",
-    "UrdfJoint",
-    "UrdfModel",
-    "description_text",
-    "free_name",
-    "is_text",
-    "joint_element",
-    "motion",
-    "numbers",
-    "origin",
-    "parse_xml",
-    "placement",
-    "read_urdf",
-    "roll_pitch_yaw",
-    "write_urdf",
-]
+    "Mimic", "UrdfJoint", "UrdfModel", "description_text", "free_name", "is_text",
+    "joint_element", "motion", "numbers", "origin", "parse_xml", "placement", "read_urdf",
+    "roll_pitch_yaw", "write_urdf",
+]  # fmt: skip
 
+#: Limits of a joint, in the order in which they are tabulated.
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 #: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.
 SINGLE = dict.fromkeys(("revolute", "continuous", "prismatic"), 1)
 FREEDOMS = {"fixed": 0, **SINGLE, "planar": 3, "floating": 6}
@@ -105,8 +95,14 @@ class UrdfJoint:
     doubts: tuple[str, ...] = ()
 
     @property
+    def lacks_limits(self) -> bool:
+        """Lacks a limit of position or speed that it should have."""
+        endless = self.type != "continuous" and math.isinf(self.upper)
+        return endless or math.isinf(self.velocity)
+
+    @property
     def movable(self) -> bool:
-        """Whether it has one degree of freedom."""
+        """Has one degree of freedom."""
         return FREEDOMS[self.type] == 1
 
 
@@ -148,12 +144,12 @@ class UrdfModel:
         return {joint.name: joint for joint in self.joints if joint.movable}
 
     @cached_property
-    def actuated(self) -> tuple[str, ...]:
+    def actuated_joints(self) -> tuple[str, ...]:
         """Names of those that follow no other joint."""
         return tuple(name for name, joint in self.movable.items() if joint.mimic is None)
 
     def leader(self, name: str) -> Mimic:
-        """The actuated joint on which a movable joint depends, and how.
+        """Find the actuated joint on which a movable joint depends, and how.
 
         Parameters
         ----------
@@ -169,12 +165,12 @@ class UrdfModel:
 
 
 def is_text(source: str | bytes | os.PathLike[str]) -> bool:
-    """Whether a description, ``source``, is given as text, and not as the path of a file."""
+    """Check whether a description, ``source``, is text, and not the path of a file."""
     return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
 
 
 def description_text(source: str | bytes | os.PathLike[str]) -> str:
-    """The text of a robot's description, in UTF-8 or else Latin-1.
+    """Read the text of a robot's description, in UTF-8 or else Latin-1.
 
     Parameters
     ----------
@@ -202,11 +198,12 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """The outermost element of a description; prefixes, namespaces and comments mean nothing.
+    """Parse a description; prefixes, namespaces and comments mean nothing.
 
     Parameters
     ----------
     text : str
+        Of a URDF or an MJCF.
 
     Raises
     ------
@@ -248,7 +245,6 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     if root.tag != "robot":
         hint = ": that is an MJCF, Robot.from_mjcf reads it" if root.tag == "mujoco" else ""
         raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{hint}")
-    macros = sorted({each.tag for each in root.iter() if each.tag.startswith("xacro:")})
     try:
         links, _ = _names(root, "link"), _names(root, "joint")
         joints = tuple(map(_joint, root.findall("joint")))
@@ -257,15 +253,21 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         if UNEXPANDED.search(text):
             raise DataError(f"{XACRO}; {error}") from error
         raise
-    doubts = [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
+    doubts = _find_macros(root)
     if lost := _lost_mimicry(joints):
         joints = tuple(replace(j, mimic=None) if j.name in lost else j for j in joints)
         doubts.append(f"mimicry of what does not move, or in a circle, by {', '.join(lost)}")
     return UrdfModel(root.get("name", ""), text, base, links, joints, tuple(doubts))
 
 
+def _find_macros(root: ElementTree.Element) -> list[str]:
+    """List the doubt that macros are left over, if there are any."""
+    macros = sorted({part.tag for part in root.iter() if part.tag.startswith("xacro:")})
+    return [f"{', '.join(macros)} left over (xacro expands them)"] if macros else []
+
+
 def _lost_mimicry(joints: Iterable[UrdfJoint]) -> list[str]:
-    """Names of joints that mimic none that moves, or in the end themselves."""
+    """Find joints that mimic none that moves, or in the end themselves."""
     mimicry = {j.name: j.mimic.joint if j.mimic else "" for j in joints if j.movable}
     lost = []
     for name, leader in mimicry.items():
@@ -288,7 +290,7 @@ def _names(root: ElementTree.Element, tag: str) -> tuple[str, ...]:
 
 
 def _root_link(links: Sequence[str], joints: Sequence[UrdfJoint]) -> str:
-    """The one link from which all others hang."""
+    """Find the one link from which all others hang."""
     known, above, below = set(links), set[str](), defaultdict[str, list[str]](list)
     for joint in joints:
         for link in {joint.parent, joint.child} - known:
@@ -331,29 +333,35 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
 
 
 def _limits(element: ElementTree.Element) -> dict[str, Any]:
-    """Range and rates; values that cannot be, as tools write -1 or 0, are no limits.
+    """Read range and rates; values that cannot be, as tools write -1 or 0, are no limits.
 
     Without a range ``<limit>`` gives effort and velocity alone.
     """
     given: dict[str, str] = getattr(element.find("limit"), "attrib", {})
-    rates = ("velocity", "acceleration", "deceleration", "jerk")
-    limits: dict[str, Any] = {key: _number(given.get(key, math.inf)) for key in rates}
-    doubts = [f'{key}="{given[key][:20]}"' for key in rates if not limits[key] > 0]
-    limits = {key: rate for key, rate in limits.items() if rate > 0}
-    slowing = limits.pop("deceleration", math.inf)
-    limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
-    low, high = (_number(given.get(key, 0.0)) for key in ("lower", "upper"))
+    limits, doubts = _rates(given)
     if element.get("type") != "continuous" and {"lower", "upper"} & given.keys():
+        ends = {key: _number(given.get(key, 0.0)) for key in ("lower", "upper")}
         # CAD programs write zeros where nobody has filled in anything
-        if low < high or (low == high and not doubts):
-            limits |= {"lower": low, "upper": high}
+        if ends["lower"] < ends["upper"] or (ends["lower"] == ends["upper"] and not doubts):
+            limits |= ends
         else:
-            doubts.append(f'lower="{given.get("lower", 0)}" upper="{given.get("upper", 0)}"')
+            doubts.append(" ".join(f'{key}="{given.get(key, 0)}"' for key in ends))
     return limits | {"doubts": tuple(doubts)}
 
 
+def _rates(given: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
+    """Read velocity, acceleration and jerk, and what of them cannot be."""
+    keys = ("velocity", "acceleration", "deceleration", "jerk")
+    rates = {key: _number(given.get(key, math.inf)) for key in keys}
+    doubts = [f'{key}="{given[key][:20]}"' for key in keys if not rates[key] > 0]
+    limits = {key: rate for key, rate in rates.items() if rate > 0}
+    slowing = limits.pop("deceleration", math.inf)
+    limits["acceleration"] = min(limits.get("acceleration", math.inf), slowing)
+    return limits, doubts
+
+
 def _number(text: str | float) -> float:
-    """Number in an attribute, NaN where it is no number."""
+    """Read a number in an attribute, NaN where it is none."""
     try:
         return float(text)
     except ValueError:
@@ -374,7 +382,7 @@ def _mimic(element: ElementTree.Element) -> Mimic | None:
 def _numbers(
     element: ElementTree.Element, tag: str, attribute: str, *default: float
 ) -> list[float]:
-    """The finite numbers of an attribute of a joint's child, as many as ``default``."""
+    """Read the finite numbers of an attribute of a joint's child, as many as ``default``."""
     child = element.find(tag)
     text = None if child is None else child.get(attribute)
     if text is None:
@@ -395,7 +403,7 @@ def _numbers(
 
 
 def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
-    """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis.
+    """Compute the matrix of an origin: rotations about the fixed x, then y, then z axis.
 
     Parameters
     ----------
@@ -410,7 +418,7 @@ def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
 
 
 def motion(kind: str, axis: Array, value: float) -> Array:
-    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation).
+    """Compute the matrix of a joint's motion (Rodrigues' formula, or a translation).
 
     Parameters
     ----------
@@ -436,7 +444,7 @@ def write_urdf(
     joints: Iterable[UrdfJoint],
     visuals: Mapping[str, Sequence[ElementTree.Element]] | None = None,
 ) -> str:
-    """The text of a description, its numbers to the last digit of float64.
+    """Write a description, its numbers to the last digit of float64.
 
     Parameters
     ----------
@@ -457,7 +465,7 @@ def write_urdf(
 
 
 def joint_element(joint: UrdfJoint) -> ElementTree.Element:
-    """The ``<joint>`` of a joint."""
+    """Write the ``<joint>`` of a joint."""
     element = ElementTree.Element("joint", name=joint.name, type=joint.type)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=joint.child)
@@ -465,10 +473,8 @@ def joint_element(joint: UrdfJoint) -> ElementTree.Element:
     if not joint.movable:
         return element
     ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
-    keys = ("lower", "upper", "velocity", "acceleration", "jerk")
-    limits = {
-        key: numbers([value]) for key in keys if abs(value := getattr(joint, key)) < math.inf
-    }
+    given = {key: getattr(joint, key) for key in LIMITS}
+    limits = {key: numbers([value]) for key, value in given.items() if abs(value) < math.inf}
     if limits:
         ElementTree.SubElement(element, "limit", limits)
     if joint.mimic is not None:
@@ -478,18 +484,18 @@ def joint_element(joint: UrdfJoint) -> ElementTree.Element:
 
 
 def origin(pose: Array) -> ElementTree.Element:
-    """The ``<origin>`` of a homogeneous matrix ``pose``."""
+    """Write the ``<origin>`` of a homogeneous matrix ``pose``."""
     rpy = roll_pitch_yaw(pose[:3, :3])
     return ElementTree.Element("origin", xyz=numbers(pose[:3, 3]), rpy=numbers(rpy))
 
 
 def numbers(values: Iterable[float]) -> str:
-    """The ``values`` of an attribute, to the last digit."""
+    """Write the ``values`` of an attribute, to the last digit."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """The angles of which :func:`placement` makes a rotation again.
+    """Compute the angles of which :func:`placement` makes a rotation again.
 
     With the yaw undone a rotation is ``R_y(pitch) R_x(roll)``, whatever the yaw: where the
     pitch is a right angle and leaves it open, any will do, and no digits are lost nearby.
@@ -497,6 +503,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     Parameters
     ----------
     rotation : ndarray of shape (3, 3)
+        Orthogonal, of determinant 1.
     """
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     back = motion("revolute", np.eye(3)[2], -yaw)[:3, :3] @ rotation
@@ -505,7 +512,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
 
 
 def free_name(name: str, taken: Iterable[str]) -> str:
-    """``name``, with as many underscores behind it as make it one that is not ``taken``."""
+    """Append underscores to ``name`` until it is not ``taken``."""
     while name in taken:
         name += "_"
     return name

@@ -98,7 +98,7 @@ def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
         given = Situation.of(given)
     if not isinstance(given, Situation):
         raise DataError(f"situations are Situation objects, got {type(given).__name__}")
-    given = given.reordered(names)
+    given = given.reorder(names)
     if len(given.joints) != len(names):
         raise ShapeError(
             f"the start posture has {len(given.joints)} joints, the model has {len(names)}: "

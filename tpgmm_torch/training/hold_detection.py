@@ -107,20 +107,21 @@ def find_holds(
     motions = [_Motion(one, kinematics, change) for one in demonstrations]
     holds: list[Hold] = []
     for name in known if frames is None else frames:
-        holds += _agreed([motion.holds(name) for motion in motions], agreement)
+        holds += _most_common_holds([motion.holds(name) for motion in motions], agreement)
     return check_holds(holds, known, kinematics.links)
 
 
 def attach_holds(
     demonstrations: Sequence[Demonstration], robot: Kinematics | None, **settings: Any
 ) -> list[Demonstration]:
-    """Demonstrations with what the robot holds in them, :func:`find_holds`, as their ``holds``.
+    """Attach what the robot holds, :func:`find_holds`, to demonstrations.
 
     Call it on demonstrations that are aligned in time, as the next to last step before ``fit``.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     robot : Kinematics or None
         Without one nothing is held.
     **settings
@@ -142,11 +143,12 @@ def attach_holds(
 def with_holds(
     demonstrations: Sequence[Demonstration], holds: Sequence[Hold]
 ) -> list[Demonstration]:
-    """Demonstrations in which the robot holds what is given.
+    """Attach given holds to demonstrations.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     holds : sequence of Hold
         Empty if it holds nothing.
     """
@@ -156,16 +158,18 @@ def with_holds(
 def holding_as_in(
     demonstration: Demonstration, joints: Tensor, kinematics: Kinematics
 ) -> Demonstration:
-    """A demonstration with what the robot holds in it where its joints are others.
+    """Attach what is held where the joints are others.
 
     Commanded joints are ahead of what they carry: what is held is found in measured ones.
 
     Parameters
     ----------
     demonstration : Demonstration
+        With poses of objects over time.
     joints : Tensor of shape (T, n_joints)
         In the order of the demonstration's.
     kinematics : Kinematics
+        Whose links may hold.
     """
     seen = replace(demonstration, joints=joints)
     return replace(demonstration, holds=find_holds([seen], kinematics))
@@ -176,15 +180,18 @@ def demonstrated_holds(
     operators: Sequence[Operator],
     kinematics: Kinematics,
 ) -> tuple[Hold, ...]:
-    """Holds of the objects that operators refer to, as the demonstrations' own ``holds`` agree.
+    """Agree on holds of the objects that operators refer to.
 
     Where the first says nothing and objects move with a link, there is a warning.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     operators : sequence of Operator
+        Which refer to objects.
     kinematics : Kinematics
+        Whose links may hold.
 
     Returns
     -------
@@ -222,7 +229,7 @@ class _Motion:
     @cached_property
     def links(self) -> dict[str, Frame]:
         """Poses (T,) of the links."""
-        ordered = self.demonstration.reordered(self.kinematics.joint_names)
+        ordered = self.demonstration.reorder(self.kinematics.joint_names)
         state = self.kinematics.state(ordered.joints)
         return {link: state.pose(link) for link in self.kinematics.links}
 
@@ -232,7 +239,7 @@ class _Motion:
         return self.demonstration.time.to(self.kinematics.lower)
 
     def holds(self, name: str) -> list[Hold]:
-        """The holds of an object, in the order of time."""
+        """Find the holds of an object, in the order of time."""
         if self.demonstration.holds is not None:
             return [hold for hold in self.demonstration.holds if hold.frame == name]
         pose, change = self.demonstration.frames[name], self.change
@@ -253,13 +260,13 @@ class _Motion:
         return _in_order([hold for *_, hold in sorted(found, key=lambda span: span[:2])])
 
     def _window(self) -> tuple[Tensor, Tensor]:
-        """For each instant, those between which its motion is measured."""
+        """Find, for each instant, those between which its motion is measured."""
         later = torch.searchsorted(self.time, self.time + SMOOTHING / 2)
         later = later.clamp(max=len(self.time) - 1)
         return torch.searchsorted(self.time, self.time - SMOOTHING / 2), later
 
     def _span(self, name: str, pose: Frame, seed: int) -> tuple[int, int, Hold] | None:
-        """Around a moment in motion: who held the object, if anyone did, and for how long."""
+        """Find who held the object around a moment in motion, if anyone, and for how long."""
         carried, change = list[tuple[str, int, int, Tensor]](), self.change
         for link, hand in self.links.items():
             grasp = pose.seen_from(hand)
@@ -281,13 +288,15 @@ class _Motion:
         lifted = first + max(int((~at_rest[first : seed + 1]).int().argmax()) - 1, 0)
         at_rest = change(pose[last : last + 1], pose) <= finest
         put = last - int((~at_rest[seed : last + 1]).flip(0).int().argmax()) + 1
-        begin = float(self.time[self._touched(link, pose, first, lifted, finest)])
+        begin = float(self.time[self._find_touch(link, pose, first, lifted, finest)])
         end = float(self.time[last] + self.time[min(put, last)]) / 2
         end = math.inf if last == len(self.time) - 1 else end
         return (first, last, Hold(name, link, begin, end)) if begin < end else None
 
-    def _touched(self, link: str, pose: Frame, first: int, lifted: int, finest: float) -> int:
-        """The instant since which a link stands as it does before it lifts an object."""
+    def _find_touch(
+        self, link: str, pose: Frame, first: int, lifted: int, finest: float
+    ) -> int:
+        """Find the instant since which a link stands as it does before it lifts an object."""
         hand, change = self.links[link], self.change
         sooner, later = self._window()
         close, _ = _run(change(hand[lifted : lifted + 1], hand) <= TRAVEL, lifted)
@@ -302,7 +311,7 @@ class _Motion:
 
 
 def _in_order(found: Sequence[Hold]) -> list[Hold]:
-    """Holds of an object, one at a time."""
+    """Put holds of an object in order, one at a time."""
     holds: list[Hold] = []
     for hold in found:
         before = holds[-1] if holds else None
@@ -316,20 +325,20 @@ def _in_order(found: Sequence[Hold]) -> list[Hold]:
 
 
 def _run(true: Tensor, seed: int) -> tuple[int, int]:
-    """First and last index of the stretch around ``seed`` in which all are true."""
+    """Find first and last index of the stretch around ``seed`` in which all are true."""
     false = torch.nonzero(~true)[:, 0]
     before, after = false[false < seed], false[false > seed]
     first = int(before[-1]) + 1 if len(before) else 0
     return first, int(after[0]) - 1 if len(after) else len(true) - 1
 
 
-def _agreed(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
-    """Of the holds of one object in each demonstration, what most of them show."""
+def _most_common_holds(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
+    """Find the holds of an object that most demonstrations show."""
     orders = [tuple(hold.link for hold in holds) for holds in shown]
     [(order, count)] = Counter(filter(None, orders)).most_common(1) or [((), 0)]
     if count < max(agreement * len(shown), 1):
         return []
-    alike = [holds for holds, own in zip(shown, orders, strict=True) if own == order]
+    alike = [holds for holds, links in zip(shown, orders, strict=True) if links == order]
     return _in_order(
         [
             replace(

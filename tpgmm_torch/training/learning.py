@@ -12,7 +12,7 @@ from torch import Tensor
 from tpgmm_torch.checks.report import Report
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import EpisodeSummary, check, summarize
-from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError
@@ -20,7 +20,7 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.covariance_shrinkage import shrink
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments
-from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
+from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -31,9 +31,9 @@ from tpgmm_torch.training.mixture_settings import (
     regularization,
 )
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
-from tpgmm_torch.training.training_rows import TrainingRows, batches_of, read_rows
+from tpgmm_torch.training.training_rows import TrainingRows, batches_of, check_alike, read_rows
 
-__all__ = ["Learned", "known", "learn"]
+__all__ = ["Learned", "from_parameters", "learn"]
 
 #: Parameters of the estimator that are the mixture's too.
 SHARED = (
@@ -53,11 +53,13 @@ class Learned:
     operators : tuple of Operator
         With the mean orientations of the demonstrations.
     kinematics : Kinematics
+        In the precision and on the device of the model.
     time : Tensor of shape (T,)
         Time grid of a typical demonstration [s].
     holds : tuple of Hold
         In the time of the skill.
     n_demonstrations : int or None
+        How many were learned from; None if that is not known.
     peaks : tuple of two Tensor of shape (n_joints,), or None
         Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
     summary : TrainingSummary or None
@@ -100,25 +102,27 @@ def learn(
         If demonstrations do not fit together, or with the robot and the operators, or cannot
         be what they are taken for.
     """
-    operators, batches = check_operators(settings["operators"]), batches_of(X, processes)
-    head = next(batches)
+    operators, batches = check_operators(settings["operators"]), batches_of(X)
+    head = next(batches, [])
+    check_alike(head, processes)
     where = settings["dtype"], settings["device"]
     kinematics = kinematics_for(head, operators, settings["robot"], *where)
     if settings["fusion"] is not None:
         settings["fusion"].check(of_joints(operators), kinematics)
-    peaks, episodes = DemonstratedPeaks(kinematics.joint_names), list[EpisodeSummary]()
+    read: list[tuple[EpisodeSummary, Array]] = []
 
-    def watched() -> Iterator[Sequence[Demonstration]]:
-        for batch in peaks.watch(chain([head], batches)):
-            episodes.extend(summarize(batch, kinematics))
+    def summarize_batches() -> Iterator[Sequence[Demonstration]]:
+        for batch in chain([head], batches):
+            peaks = [joint_peaks(one.reorder(kinematics.joint_names)) for one in batch]
+            read.extend(zip(summarize(batch, kinematics), peaks, strict=True))
             yield batch
 
     rows = read_rows(
-        watched(), operators, kinematics,
+        summarize_batches(), operators, kinematics,
         responsibilities=settings["responsibilities"], processes=processes,
     )  # fmt: skip
     rows = rows if interval is None else rows.within(*interval)
-    episodes = list(chain.from_iterable(processes.gather(episodes)))
+    episodes, peaks = zip(*chain.from_iterable(processes.gather(read)), strict=True)
     _report(rows, episodes, kinematics, settings)
     moments = ColumnMoments.of(rows.rows, processes)
     shape = {name: settings[name] for name in ("reg_covar", "covariance_type")}
@@ -135,12 +139,12 @@ def learn(
         rows.time,
         rows.holds,
         rows.n_demonstrations,
-        peaks.result(processes),
+        typical_peaks(peaks),
         TrainingSummary.of(episodes, kinematics),
     )
 
 
-def known(
+def from_parameters(
     weights: Any,
     means: Sequence[Any],
     covariances: Sequence[Any],
@@ -150,7 +154,7 @@ def known(
     holds: Sequence[Hold] = (),
     **others: Any,
 ) -> Learned:
-    """A mixture of given parameters, which are kept as they are.
+    """Make a mixture of given parameters, which are kept as they are.
 
     Parameters
     ----------
@@ -189,7 +193,7 @@ def known(
 def _of_mixture(
     settings: Mapping[str, Any], operators: Sequence[Operator], kinematics: Kinematics
 ) -> dict[str, Any]:
-    """Parameters of the mixture of the local data of all operators."""
+    """Collect parameters of the mixture of the local data of all operators."""
     return {name: settings[name] for name in SHARED} | {
         "blocks": block_widths(operators, kinematics)
     }

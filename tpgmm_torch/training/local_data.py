@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -14,13 +14,12 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = [
-    "Expected", "Motion", "at_phases", "constant_columns", "like", "local_data", "rows_of",
+    "Expected", "Motion", "at_phases", "constant_columns", "like", "local_data", "match_rows",
 ]  # fmt: skip
 
 #: The local coordinates (T, D_j) of operator j that are expected at times (T,).
@@ -34,6 +33,7 @@ class Motion:
     Parameters
     ----------
     time : Tensor of shape (T,)
+        Instants [s].
     state : RobotState
         Of batch shape (T,), with the objects that it holds.
     frames : mapping of str to Frame
@@ -53,7 +53,7 @@ class Motion:
         *,
         attached: bool = False,
     ) -> Self:
-        """The motion of a ``demonstration`` in which ``holds`` says what the robot holds.
+        """Compute the motion of a ``demonstration`` in which the robot holds ``holds``.
 
         Where that is ``attached``, the joints move it; else its Jacobians are zero.
 
@@ -68,7 +68,7 @@ class Motion:
                 f"a demonstration has {demonstration.n_joints} joints, the robot has {n}: "
                 f"{kinematics.joint_names}"
             )
-        ordered = demonstration.reordered(kinematics.joint_names)
+        ordered = demonstration.reorder(kinematics.joint_names)
         state = kinematics.state(ordered.joints)
         if ordered.wrenches:
             measured = {link: one.to(state.joints) for link, one in ordered.wrenches.items()}
@@ -80,7 +80,7 @@ class Motion:
         return cls(time, state, frames)
 
     def coordinates(self, operator: Operator, kinematics: Kinematics) -> Tensor:
-        """Local coordinates (T, D_j), quaternions continuous in sign."""
+        """Compute local coordinates (T, D_j), quaternions continuous in sign."""
         return operator.along(self.time, self.state, self.frames, kinematics)
 
 
@@ -91,13 +91,16 @@ def local_data(
     expected: Expected | None = None,
     holds: Sequence[Hold] = (),
 ) -> list[Tensor]:
-    """Rows of time and local coordinates of each demonstration.
+    """Compute rows of time and local coordinates of each demonstration.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
+        Of one skill, aligned in time.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     expected : callable, optional
         Quaternions come to the side of what it says; by default to that of the first
         demonstration, and columns that vary by rounding alone become constant.
@@ -114,7 +117,12 @@ def local_data(
         If a demonstration has not the robot's joints.
     """
     motions = [Motion.of(one, kinematics, holds) for one in demonstrations]
-    rows = list(rows_of(motions, operators, kinematics, expected))
+    seen = [[motion.coordinates(one, kinematics) for one in operators] for motion in motions]
+    side = expected or like(seen[0])
+    rows = [
+        match_rows(motion, local, operators, kinematics, side)
+        for motion, local in zip(motions, seen, strict=True)
+    ]
     if expected is not None:
         return rows
     together = torch.cat(rows)
@@ -124,68 +132,63 @@ def local_data(
     return list(together.split([len(row) for row in rows]))
 
 
-def rows_of(
-    motions: Iterable[Motion],
+def match_rows(
+    motion: Motion,
+    local: Sequence[Tensor],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    expected: Expected | None = None,
-    processes: Processes = ALONE,
-) -> Iterator[Tensor]:
-    """Rows of time and local coordinates of motions, one after the other.
+    expected: Expected,
+) -> Tensor:
+    """Join time and local coordinates of a motion, quaternions on the side of what is expected.
 
     Parameters
     ----------
-    motions : iterable of Motion
-        At least one.
+    motion : Motion
+        Whose time counts.
+    local : sequence of Tensor of shape (T_m, D_j)
+        Its coordinates, as each of the ``operators`` sees them.
     operators : sequence of Operator
+        Say where quaternions are.
     kinematics : Kinematics
-    expected : callable, optional
-        Quaternions come to the side of what it says; by default to that of the first motion.
-    processes : Processes
-        Of which the first has the first motion.
+        On which the operators act.
+    expected : callable
+        Says on which side quaternions are.
 
-    Yields
-    ------
+    Returns
+    -------
     Tensor of shape (T_m, sum_j (1 + D_j))
     """
-    for motion in motions:
-        local = [motion.coordinates(one, kinematics) for one in operators]
-        if expected is None:
-            first = processes.gather([block.cpu() for block in local])[0]
-            expected = like([block.to(kinematics.lower) for block in first])
-        blocks: list[Tensor] = []
-        for j, (operator, block) in enumerate(zip(operators, local, strict=True)):
-            template, sign = expected(j, motion.time), torch.ones_like(block[0])
-            for start in operator.quaternion_starts(kinematics):
-                columns = slice(start, start + 4)
-                agreement = (block[:, columns] * template[:, columns]).sum()
-                sign[columns] = quaternions.hemisphere_sign(agreement)
-            blocks += [motion.time[:, None], block * sign]
-        yield torch.cat(blocks, dim=1)
+    blocks: list[Tensor] = []
+    for j, (operator, block) in enumerate(zip(operators, local, strict=True)):
+        template, sign = expected(j, motion.time), torch.ones_like(block[0])
+        for start in operator.quaternion_starts(kinematics):
+            columns = slice(start, start + 4)
+            agreement = (block[:, columns] * template[:, columns]).sum()
+            sign[columns] = quaternions.hemisphere_sign(agreement)
+        blocks += [motion.time[:, None], block * sign]
+    return torch.cat(blocks, dim=1)
 
 
 def like(templates: Sequence[Tensor]) -> Expected:
-    """Coordinates of one motion, at equal phase, as what is expected.
+    """Expect the coordinates of one motion, at equal phase.
 
     Parameters
     ----------
     templates : sequence of Tensor of shape (T, D_j)
         Of each operator.
     """
-
-    def expected(j: int, time: Tensor) -> Tensor:
-        return at_phases(templates[j], len(time))
-
-    return expected
+    return lambda j, time: at_phases(templates[j], len(time))
 
 
 def at_phases(rows: Tensor, count: int) -> Tensor:
-    """Some rows of one motion, at equal distances from first to last.
+    """Select rows of one motion, at equal distances from first to last.
 
     Parameters
     ----------
     rows : Tensor of shape (T, ...)
+        Of one motion, in the order of time.
     count : int
+        Number of rows to select.
 
     Returns
     -------
@@ -197,14 +200,16 @@ def at_phases(rows: Tensor, count: int) -> Tensor:
 def constant_columns(
     smallest: Tensor, largest: Tensor, operators: Sequence[Operator], kinematics: Kinematics
 ) -> Tensor:
-    """Columns that vary by rounding alone, to be made constant.
+    """Find columns that vary by rounding alone, to be made constant.
 
     Parameters
     ----------
     smallest, largest : Tensor of shape (sum_j (1 + D_j),)
         Of each column.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
 
     Returns
     -------

@@ -17,8 +17,7 @@ from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Canonical, Operator, Wrench
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
-from tpgmm_torch.robots.joint_space import JointSpace
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.kinematics import JointSpace, Kinematics
 
 __all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
 
@@ -27,7 +26,7 @@ COMPARED = (Canonical, Wrench, *POSE_OPERATORS)
 
 
 def check_operators(operators: Any) -> tuple[Operator, ...]:
-    """The operators; ``(Canonical(),)`` where none are given.
+    """Check the operators; ``(Canonical(),)`` where none are given.
 
     Raises
     ------
@@ -66,15 +65,16 @@ def kinematics_for(
     dtype: str,
     device: str,
 ) -> Kinematics:
-    """Kinematics that the operators act on, checked to have what they need.
+    """Choose the kinematics that the operators act on, and check what they need.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
         At least one; they name the joints where there is no robot.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     robot : Kinematics, optional
-        Without it the joints alone, a :class:`~tpgmm_torch.robots.joint_space.JointSpace`.
+        Without it the joints alone, a :class:`~tpgmm_torch.robots.kinematics.JointSpace`.
     dtype, device : str
         In what precision and where it shall compute, as the estimator's parameters say.
 
@@ -102,7 +102,7 @@ def kinematics_for(
 
 
 def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
-    """1 + D_j of each of the operators on the kinematics: time, and its local coordinates."""
+    """Compute 1 + D_j of each of the operators on the kinematics: time, and coordinates."""
     return tuple(1 + operator.dimension(kinematics) for operator in operators)
 
 
@@ -114,7 +114,7 @@ def regularization(
     reg_covar: float,
     covariance_type: str,
 ) -> NDArray[np.float64]:
-    """``reg_covar`` and the operators' tolerances, as shares of each column's variance.
+    """Express ``reg_covar`` and tolerances as shares of each column's variance.
 
     For coordinates that are deviations from a path, ``reg_covar`` is relative to the variance
     of both: it is the same whether a base moves or stands.
@@ -124,7 +124,9 @@ def regularization(
     moments : ColumnMoments
         Of the rows that a mixture is learned from.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     reg_covar, covariance_type
         Parameters of :class:`~tpgmm_torch.TaskParameterizedGMM`.
 
@@ -144,5 +146,5 @@ def regularization(
     widths = block_widths(operators, kinematics)
     scales = moments.scales(widths, isotropic=covariance_type == "spherical")
     paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]
-    own = reg_covar * (1 + np.concatenate(paths) / scales**2)
-    return own + (np.concatenate(tolerances) / scales) ** 2
+    shares = reg_covar * (1 + np.concatenate(paths) / scales**2)
+    return shares + (np.concatenate(tolerances) / scales) ** 2

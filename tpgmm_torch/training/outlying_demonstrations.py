@@ -15,7 +15,7 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.operators import Canonical, Operator
@@ -28,13 +28,9 @@ from tpgmm_torch.training.mixture_settings import check_operators, kinematics_fo
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 __all__ = [
-    "Outlying",
-    "comparable_coordinates",
-    "drop_outliers",
-    "outlying_demonstrations",
-    "outlying_rows",
-    "unlike_the_others",
-]
+    "Outlying", "comparable_coordinates", "drop_outliers", "outlying_demonstrations",
+    "outlying_rows", "unlike_the_others",
+]  # fmt: skip
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
@@ -75,7 +71,7 @@ def outlying_demonstrations(
     threshold: float = 8.0,
     duration: float = 0.5,
 ) -> tuple[Outlying, ...]:
-    """Demonstrations far from the median of all, at instants at which the others agree.
+    """Find demonstrations far from the median, at instants at which others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
     more than ``threshold`` times 1.4826 times the median distance from the median. Where the
@@ -89,7 +85,9 @@ def outlying_demonstrations(
         none that are unlike the others, and where it would be more than a third of them, they
         show several ways rather than mistakes.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     threshold : float, default=8.0
         So many robust standard deviations from the median are unlike the others. On real
         recordings those who are not reach 6.1, those whose frame was taken at a wrong instant,
@@ -111,12 +109,14 @@ def outlying_demonstrations(
 def outlying_rows(
     rows: TrainingRows, kinematics: Kinematics, *, threshold: float = 8.0, duration: float = 0.5
 ) -> tuple[Outlying, ...]:
-    """:func:`outlying_demonstrations` of rows that are read, of all batches and processes.
+    """Find outlying demonstrations in rows that are read.
 
     Parameters
     ----------
     rows : TrainingRows
+        Of all demonstrations.
     kinematics : Kinematics
+        On which the operators act.
     threshold, duration : float
         As there.
     """
@@ -147,7 +147,7 @@ def outlying_rows(
 def comparable_coordinates(
     data: Tensor, operators: Sequence[Operator], kinematics: Kinematics, least: float = 0.0
 ) -> Iterator[tuple[Operator, Tensor, float]]:
-    """Coordinates of demonstrations that have one unit, by operator, and what is near in it.
+    """Yield coordinates that have one unit, by operator, and what is near in it.
 
     Parameters
     ----------
@@ -156,6 +156,7 @@ def comparable_coordinates(
     operators : sequence of Operator
         Members of a :class:`Stack` come one by one.
     kinematics : Kinematics
+        On which the operators act.
     least : float, default=0
         Joints are compared in units of their ranges, of at least that [rad or m].
 
@@ -200,7 +201,7 @@ def drop_outliers(
     threshold: float = 8.0,
     duration: float = 0.5,
 ) -> list[Demonstration]:
-    """Demonstrations without those unlike the others, of which a warning tells.
+    """Drop demonstrations unlike the others, with a warning.
 
     Of five or more, up to a third are left out.
 
@@ -240,7 +241,7 @@ def drop_outliers(
 
 
 def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:
-    """A finding that names demonstrations unlike the others, the worst first.
+    """Describe demonstrations unlike the others, the worst first.
 
     Parameters
     ----------
@@ -257,7 +258,7 @@ def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:
     ]
     return Finding(
         "outliers",
-        f"{len(outlying)} of {count} are unlike the others: {listed(places)}",
+        f"{len(outlying)} of {count} are unlike the others: {shorten_list(places)}",
         "Is the frame right, and the event's time? drop_outliers(demonstrations, operators, "
         "robot) leaves them out",
         (format_operator(worst.operator),),

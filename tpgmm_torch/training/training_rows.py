@@ -1,4 +1,10 @@
-"""Demonstrations as the rows that a mixture learns from, read once."""
+"""Demonstrations as the rows that a mixture learns from, read once.
+
+Where one responsibility is for an instant, EM asks of the M points of that instant only for
+their mean log-density and their moments, block by block: both are functions of their mean and
+scatter. A few points with the same mean and scatter per block therefore stand for all, however
+many demonstrations there are: data beyond memory become a table of the length of one.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +25,21 @@ from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.equivalent_points import equivalent_rows
-from tpgmm_torch.training.force_axes import with_force_axes
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, rows_of
-from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.local_data import (
+    Motion,
+    at_phases,
+    constant_columns,
+    like,
+    match_rows,
+)
 from tpgmm_torch.training.mixture_settings import block_widths
+from tpgmm_torch.training.operator_completion import with_force_axes, with_mean_orientations
 
-__all__ = ["TrainingRows", "batches_of", "read_rows", "typical"]
+__all__ = [
+    "TrainingRows", "batches_of", "check_alike", "equivalent_points", "equivalent_rows",
+    "read_rows", "typical",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +79,7 @@ class TrainingRows:
     edges: NDArray[np.intp]
 
     def at_phases(self, count: int) -> Tensor:
-        """Rows of all demonstrations of all processes at equal phase.
+        """Select rows of all demonstrations of all processes at equal phase.
 
         Parameters
         ----------
@@ -77,12 +90,12 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        each = (self.stored[start:stop] for start, stop in pairwise(self.edges))
-        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in each])
+        episodes = (self.stored[start:stop] for start, stop in pairwise(self.edges))
+        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in episodes])
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
-        """Those rows, in memory, whose time is from ``begin`` to before ``end`` [s].
+        """Select the rows, in memory, whose time is from ``begin`` to before ``end`` [s].
 
         Raises
         ------
@@ -91,24 +104,22 @@ class TrainingRows:
         """
         inside = (self.time >= begin) & (self.time < end)
         rows, stored = self.rows[:], self.stored[:]
-        own, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
-        if int(inside.sum()) < 2 or not own.any():
+        chosen, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
+        if int(inside.sum()) < 2 or not chosen.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
         edges = np.append(0, np.cumsum(kept))[self.edges]
         return replace(
-            self, rows=rows[own], time=self.time[inside], stored=stored[kept], edges=edges
+            self, rows=rows[chosen], time=self.time[inside], stored=stored[kept], edges=edges
         )
 
 
-def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
-    """Demonstrations in batches, checked as they come; a list of them is one batch.
+def batches_of(X: Any) -> Iterator[list[Demonstration]]:
+    """Check demonstrations batch by batch; a list of them is one batch.
 
     Parameters
     ----------
     X : iterable of Demonstration, or of sequence of Demonstration
         Batches are read once.
-    processes : Processes
-        All of which need demonstrations of the same joints and frames.
 
     Yields
     ------
@@ -117,8 +128,7 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
     Raises
     ------
     DataError, ShapeError
-        If there is none, or some differ from those before in joints or frames; the message
-        says in which batch.
+        If some differ from those before in joints or frames; the message says in which batch.
     """
     first: list[Demonstration] = []
     for number, batch in enumerate(_split(X)):
@@ -129,16 +139,12 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
                 raise
             kind = type(error) if isinstance(error, DataError) else DataError
             raise kind(f"batch {number} of demonstrations: {error}") from error
-        if not first:
-            first = checked[:1]
-            _check_alike(first[0], processes)
+        first = first or checked[:1]
         yield checked
-    if not first:
-        _check_alike(None, processes)
 
 
 def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
-    """The batches of X, without empty ones; X itself if it holds demonstrations."""
+    """Yield the batches of X, without empty ones; X itself if it holds demonstrations."""
     if not isinstance(X, Iterable):
         check_demonstrations(X)  # says what is wrong
     walk = iter(X)
@@ -149,20 +155,27 @@ def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
         yield list(chain([first], walk))
 
 
-def _check_alike(first: Demonstration | None, processes: Processes) -> None:
-    """Refuse, in all processes, shares without demonstrations, or of other joints or frames."""
+def check_alike(batch: Sequence[Demonstration], processes: Processes) -> None:
+    """Refuse, in all processes, shares without demonstrations, or of other joints or frames.
+
+    Parameters
+    ----------
+    batch : sequence of Demonstration
+        The first of this process; empty if it has none.
+    processes : Processes
+        All of which need demonstrations of the same joints and frames.
+
+    Raises
+    ------
+    DataError
+        If they do not have them; the message says in which process.
+    """
     text = ""
-    if first is not None:
+    for first in batch[:1]:
         joints = list(first.joint_names or [f"{first.n_joints} without names"])
         text = f"joints {joints}, frames {sorted(first.frames)}"
     texts = processes.gather(text)
-    if "" in texts:
-        without = [rank for rank, text in enumerate(texts) if not text]
-        where = f" in process(es) {without} of {processes.count}" if processes.count > 1 else ""
-        raise DataError(
-            f"there are no demonstrations, X is empty{where}: "
-            "expected at least one demonstration"
-        )
+    processes.check_share(texts, "demonstration")
     for rank, other in enumerate(texts):
         if other != texts[0]:
             raise DataError(
@@ -188,9 +201,13 @@ def read_rows(
     batches : iterable of sequence of Demonstration
         Of this process, at least one.
     operators : sequence of Operator
+        In whose local coordinates it is seen.
     kinematics : Kinematics
+        On which the operators act.
     responsibilities : {"auto", "instant", "point"}
+        Whether one is for all points of an instant, as of the estimator.
     processes : Processes
+        Among which the rows are spread.
 
     Raises
     ------
@@ -206,33 +223,44 @@ def read_rows(
     operators = processes.gather(completed)[0]
     following = chain.from_iterable(chain([later or ()], walk))
     all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
-    each = rows_of(all_motions, operators, kinematics, processes=processes)
-    stored, edges = _stored((rows.cpu().numpy() for rows in each), alone)
-    first = _made_constant(stored, edges[1], operators, kinematics, processes)
+    seen = ((m, [m.coordinates(one, kinematics) for one in operators]) for m in all_motions)
+    first = next(seen)
+    shown = processes.gather([block.cpu() for block in first[1]])[0]
+    side = like([block.to(kinematics.lower) for block in shown])
+    episodes = (
+        match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
+        for motion, blocks in chain([first], seen)
+    )
+    stored, edges = _store_rows(episodes, alone)
+    reference = _remove_rounding(stored, edges[1], operators, kinematics, processes)
     time, number = _typical_time(stored, edges, processes)
-    time, own = time.to(kinematics.lower), tuple(operators)
-    rows = TrainingRows(stored, 1, time, number, own, holds, processes, stored, edges)
-    return _grouped(rows, first, responsibilities, block_widths(operators, kinematics))
+    time = time.to(kinematics.lower)
+    rows = TrainingRows(
+        stored, 1, time, number, tuple(operators), holds, processes, stored, edges
+    )
+    return _group_instants(
+        rows, reference, responsibilities, block_widths(operators, kinematics)
+    )
 
 
-def _stored(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
-    """Rows of all demonstrations, in a file unless in one batch, and where each begins."""
+def _store_rows(episodes: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
+    """Store rows, in a file unless of one batch, and where each demonstration begins."""
     kept: Any = [] if alone else RowFile()
     lengths = [0]
-    for rows in each:
+    for rows in episodes:
         lengths.append(len(rows))
         kept.append(rows)
     return np.concatenate(kept) if alone else kept, np.cumsum(lengths)
 
 
-def _made_constant(
+def _remove_rounding(
     stored: Rows,
     length: int,
     operators: Sequence[Operator],
     kinematics: Kinematics,
     processes: Processes,
 ) -> NDArray[Any]:
-    """Rows of the first demonstration of all; what varies by rounding alone is as in it."""
+    """Make constant what varies by rounding alone; return the first demonstration."""
     moments = ColumnMoments.of(stored, processes)
     first = processes.gather(stored[:length])[0]
     low, high = (
@@ -243,10 +271,10 @@ def _made_constant(
     return np.where(constant, first[0], first)
 
 
-def _grouped(
+def _group_instants(
     rows: TrainingRows, first: NDArray[Any], responsibilities: str, widths: Sequence[int]
 ) -> TrainingRows:
-    """Rows of one instant together where the demonstrations have one time grid.
+    """Group rows of one instant where the demonstrations have one time grid.
 
     Parameters
     ----------
@@ -267,17 +295,17 @@ def _grouped(
         instants = stored.reshape(number, *first.shape).swapaxes(0, 1)
         return replace(rows, rows=instants.reshape(stored.shape), group_size=number)
     points, size = equivalent_rows(stored, first, widths, processes)
-    own = processes.share(range(len(points) // size))
-    return replace(rows, rows=points[own[0] * size : (own[-1] + 1) * size], group_size=size)
+    part = processes.share(range(len(points) // size))
+    return replace(rows, rows=points[part[0] * size : (part[-1] + 1) * size], group_size=size)
 
 
 def _typical_time(
     stored: Rows, edges: NDArray[np.intp], processes: Processes
 ) -> tuple[Tensor, int]:
-    """Time grid of the demonstration of median duration of all processes, and their number."""
+    """Find the time grid of median duration, and count the demonstrations of all."""
     spans = [(float(stored[i, 0]), float(stored[j - 1, 0])) for i, j in pairwise(edges)]
-    own = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
-    everyone = list(chain.from_iterable(processes.gather(own)))
+    entries = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
+    everyone = list(chain.from_iterable(processes.gather(entries)))
     begins, durations, owners, places = zip(*everyone, strict=True)
     chosen = typical(begins, durations)
     place = places[chosen] if owners[chosen] == processes.rank else 0
@@ -286,7 +314,7 @@ def _typical_time(
 
 
 def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
-    """Which demonstration has the median duration.
+    """Find the demonstration that has the median duration.
 
     Parameters
     ----------
@@ -296,3 +324,76 @@ def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
     late = min(begins) + 0.1 * max(durations)
     whole = [number for number, begin in enumerate(begins) if begin <= late]
     return sorted(whole, key=lambda number: durations[number])[len(whole) // 2]
+
+
+def equivalent_rows(
+    rows: Rows,
+    reference: NDArray[np.float64],
+    widths: Sequence[int],
+    processes: Processes = ALONE,
+) -> tuple[NDArray[np.float64], int]:
+    """Replace the demonstrations of all processes by rows, some per instant.
+
+    Parameters
+    ----------
+    rows : array of shape (M T, sum D_j), or RowFile
+        Demonstrations of T rows each, one after the other.
+    reference : array of shape (T, sum D_j)
+        Rows near all others, the same in all processes: deviations are taken from it.
+    widths : sequence of int
+        D_j of each block.
+    processes : Processes
+        Among which the rows are spread.
+
+    Returns
+    -------
+    array of shape (T * n, sum D_j)
+        The n points of each instant together.
+    int
+        How many points stand for an instant, n.
+    """
+    origin = torch.from_numpy(np.asarray(reference, dtype=np.float64))
+    own_total = torch.zeros_like(origin)
+    own_squares = [origin.new_zeros(len(origin), width, width) for width in widths]
+    for start in range(0, len(rows), len(origin)):
+        episode = np.asarray(rows[start : start + len(origin)], dtype=np.float64)
+        deviation = torch.from_numpy(episode) - origin
+        own_total += deviation
+        for square, block in zip(own_squares, deviation.split(list(widths), 1), strict=True):
+            square += block[:, :, None] * block[:, None, :]
+    own_count = origin.new_tensor(len(rows) / len(origin))
+    count, total, *squares = processes.sum(own_count, own_total, *own_squares)
+    size, blocks = max(widths) + 1, []
+    for mean, square in zip((total / count).split(list(widths), 1), squares, strict=True):
+        scatter = square / count - mean[:, :, None] * mean[:, None, :]
+        blocks.append(equivalent_points(mean, scatter, size))
+    points = origin[:, None] + torch.cat(blocks, -1)
+    return points.flatten(0, 1).numpy(), size
+
+
+def equivalent_points(mean: Tensor, scatter: Tensor, size: int) -> Tensor:
+    """Make points of given mean and mean squared deviation.
+
+    Parameters
+    ----------
+    mean : Tensor of shape (T, D)
+        Of the points of each instant.
+    scatter : Tensor of shape (T, D, D)
+        Positive semi-definite.
+    size : int
+        How many points, more than D.
+
+    Returns
+    -------
+    Tensor of shape (T, size, D)
+    """
+    # in units of the deviations, so that rounding is relative to each coordinate
+    scale = scatter.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
+    unit = torch.where(scale > 0, scale, 1.0)
+    values, vectors = torch.linalg.eigh(scatter / (unit[:, :, None] * unit[:, None, :]))
+    root = scale[..., None] * vectors * values.clamp(min=0).sqrt()[:, None]  # R R^T = scatter
+    # orthonormal directions that are orthogonal to (1, ..., 1): their points have mean zero
+    ones = torch.eye(size, dtype=mean.dtype)
+    ones[:, 0] = 1.0
+    directions = torch.linalg.qr(ones).Q[:, 1 : mean.shape[1] + 1]
+    return mean[:, None] + size**0.5 * directions @ root.mT

@@ -19,8 +19,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tpgmm_control.sensing.states import check_positive
 from tpgmm_control.sensing.wrenches import Wrenches
-from tpgmm_torch.constraints import check_positive
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.robots.kinematics import RobotState
@@ -135,5 +135,7 @@ class Offsets:
         """
         for operator, value in self.values.items():
             axes = operator.directions(state, frames)
-            state = state.displaced(operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2))
+            state = state.displace_link(
+                operator.link, -(value.unsqueeze(-2) @ axes).squeeze(-2)
+            )
         return state

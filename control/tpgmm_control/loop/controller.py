@@ -59,6 +59,7 @@ from tpgmm_control.loop.clock import Clock
 from tpgmm_control.loop.command import Command
 from tpgmm_control.loop.estimate import choose, estimate
 from tpgmm_control.loop.gates import Gates, Moment
+from tpgmm_control.loop.gripping import gripping_joints
 from tpgmm_control.loop.hold import Holds
 from tpgmm_control.loop.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_control.loop.places import Places
@@ -217,7 +218,7 @@ class Controller:
         self._trusts, self._feedback = trust is not None, feedback
         self._impedance, self._gripping = (
             impedance or Impedance(kinematics),
-            kinematics.gripping(),
+            gripping_joints(kinematics),
         )
         self._inputs = None
         if trust is not None:

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from tpgmm_control.loop.clock import Clock
 from tpgmm_control.sensing.servo import FLOOR, Flags, Servo
+from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.states import changed
 
 __all__ = ["LONGEST_TICK", "RUNNING", "Progress", "Seen"]
 
@@ -200,7 +200,7 @@ class Progress:
         servo = self.servo.update(
             reference, seen.joints, dt, seen.jumped[:, None], running[:, None]
         )
-        new = changed(self, servo=servo, relocalized=np.zeros_like(self.placed))
+        new = replace_fields(self, servo=servo, relocalized=np.zeros_like(self.placed))
         new = new._timed(seen)
         if self.clock.kind == "even" or not (
             (self.mode != RUNNING).any() or self.compared.any() or (new.off_for > 0).any()
@@ -213,7 +213,7 @@ class Progress:
         """Progress where nothing is measured."""
         if obstructed is not None and self.clock.kind != "even":
             dt = dt * np.clip(2 - 2 * obstructed, 0.0, 1.0)
-        return changed(self, time=self._until_end(self.clock.speed * dt))
+        return replace_fields(self, time=self._until_end(self.clock.speed * dt))
 
     def arrived(self, reference: Array, velocity: Array, readings: Array) -> Flags:
         """Robots whose joints are where the reference is, at rest: (B,).
@@ -244,7 +244,7 @@ class Progress:
             From where they go on; NaN from where they are.
         """
         now, rest = (np.where(np.isfinite(time), time, x) for x in (self.time, self.rest_time))
-        return changed(self, stop=stop, time=now, rest_time=rest)
+        return replace_fields(self, stop=stop, time=now, rest_time=rest)
 
     def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
         """Where references go: of robots that run, the wanted postures (B, n_joints).
@@ -259,7 +259,7 @@ class Progress:
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
         goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
-        return changed(self, wanted=wanted), goal
+        return replace_fields(self, wanted=wanted), goal
 
     @property
     def _lead(self) -> Array:
@@ -296,7 +296,7 @@ class Progress:
         stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
         off = ~stands & (excess > OFF) | stalled
         now = np.array((servo.reading, servo.expected))
-        return changed(
+        return replace_fields(
             self,
             time=time,
             rate=rate,
@@ -351,7 +351,7 @@ class Progress:
         along = off & tells & (np.abs(ran - moved) < 0.5 * np.abs(moved))
         along &= (asked & self.compared)[:, None]
         held = self.mode == HELD
-        return changed(
+        return replace_fields(
             self,
             servo=servo.with_offsets(along) if along.any() else servo,
             model=model,
@@ -380,7 +380,7 @@ class Progress:
         off |= moved[:, None] & known  # who was displaced is met in all joints
         target = np.where(off, servo.corrected, reference)
         new = self._switched(rows, PROBING, target)
-        new = changed(
+        new = replace_fields(
             new,
             stuck=np.where(rows[:, None], off, self.stuck),
             opened=np.where(rows[:, None], np.abs(servo.gap), self.opened),
@@ -410,7 +410,7 @@ class Progress:
         if not held.any():
             return new
         target = np.where(known, servo.corrected, reference)
-        new = changed(
+        new = replace_fields(
             new._switched(held, HELD, target),
             reading=np.where(held[:, None], servo.reading, new.reading),
         )
@@ -431,7 +431,7 @@ class Progress:
         back &= (np.abs(self.rest_time - self.resumed) > NEARBY) & ~self.displaced
         back &= self.clock.kind == "localizing"
         new = self._switched(rows, RUNNING, self.target)
-        return changed(
+        return replace_fields(
             new,
             time=np.where(back, self.rest_time, self.time),
             resumed=np.where(back, self.rest_time, self.resumed),
@@ -448,7 +448,7 @@ class Progress:
         for row, place in found.items():
             if place is not None and abs(place - time[row]) > NEARBY:
                 time[row], placed[row], moved[row] = place, True, True
-        return changed(
+        return replace_fields(
             self,
             time=time,
             placed=placed,
@@ -471,7 +471,7 @@ class Progress:
                 servo = servo.put((self.displaced & rows)[:, None])
             rest = np.where(rows[:, None], servo.reading, rest)
             bank = np.where(rows[:, None], servo.second, bank)
-        return changed(
+        return replace_fields(
             self,
             servo=servo,
             rest=rest,

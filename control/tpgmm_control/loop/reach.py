@@ -12,12 +12,16 @@ from torch import Tensor
 from tpgmm_control.motion.follower import Follower, Seconds
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import TPGMMError
-from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Fade", "nearest"]
+__all__ = ["Fade", "fading_time", "nearest"]
+
+#: How fast a gap fades in the mean [rad/s or m/s], where that takes less time than a blend;
+#: the least share of the blend that it takes.
+FADING, SHORTEST = 0.03, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,3 +144,20 @@ def nearest(
         if raises:
             raise
         return estimate.joints, search
+
+
+def fading_time(gap: Tensor, blend: float | Tensor) -> Tensor:
+    """Compute the seconds (...) in which the gap of robots that go on fades.
+
+    A robot that was held stands a few milliradians from its reference: where it presses on
+    something, it should soon press again.
+
+    Parameters
+    ----------
+    gap : Tensor
+        From the reference, shape (..., n) [rad or m].
+    blend : float or Tensor of shape (...)
+        The longest that it takes [s]; a tenth of it is the shortest.
+    """
+    longest = torch.as_tensor(blend).to(gap)
+    return (gap.abs().amax(-1) / FADING).clamp(SHORTEST * longest, longest)

@@ -22,6 +22,7 @@ from typing import Self
 import numpy as np
 
 from tpgmm_control.motion.follower import Follower
+from tpgmm_control.motion.limit_arrays import limit_arrays
 from tpgmm_control.motion.trajectory_generator import braked_part, first_part, rest_positions
 from tpgmm_torch.data.arrays import Array
 
@@ -50,7 +51,7 @@ class Braking:
     @classmethod
     def of(cls, before: Follower, after: Follower) -> Self:
         """Of a follower ``before`` a tick; one ``after`` it knows how long the tick takes."""
-        limits, start = before.bounds.arrays, before.moment.motion
+        limits, start = limit_arrays(before.bounds), before.moment.motion
         shape = start.shape[1:]
         dt = np.broadcast_to(after.moment.dt, shape).ravel()
         rates = np.stack(
@@ -92,6 +93,6 @@ def rest(follower: Follower, motion: Array | None = None) -> Array:
         Position, velocity and acceleration; by default the follower's.
     """
     motion = follower.moment.motion if motion is None else motion
-    limits, shape = follower.bounds.arrays, motion.shape[1:]
+    limits, shape = limit_arrays(follower.bounds), motion.shape[1:]
     rates = (np.broadcast_to(x, shape).ravel() for x in (limits.acceleration, limits.jerk))
     return rest_positions(motion.reshape(3, -1), *rates).reshape(shape)

@@ -25,10 +25,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_control.motion.limit_arrays import ROUNDING, limit_arrays
 from tpgmm_control.motion.trajectory_generator import first_part, stopping_range
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.motion.motion_bounds import ROUNDING, MotionBounds
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 
 __all__ = ["Follower", "Seconds"]
 
@@ -160,7 +161,7 @@ class Follower:
 
     def _fits(self, exact: Moment) -> Mask:
         """Joints of which that may be the next moment; no reference leaves the limits."""
-        limits, position = self.bounds.arrays, exact.motion[0]
+        limits, position = limit_arrays(self.bounds), exact.motion[0]
         within = (position >= limits.lower) & (position <= limits.upper)
         return within & self.moment.allows(exact, self.bounds)
 
@@ -184,7 +185,7 @@ class Follower:
             raise DataError(f"a tick takes a positive number of seconds, got dt={dt}")
         moment, bounds, raw = self.moment, self.bounds, as_array(wanted)
         known = np.where(np.isfinite(raw), raw, moment.motion[0])
-        target = np.clip(known, bounds.arrays.lower, bounds.arrays.upper)
+        target = np.clip(known, *limit_arrays(bounds)[:2])
         exact = moment.taken(target, _column(dt))
         fits = moment.allows(exact, bounds)
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
@@ -259,7 +260,7 @@ class Moment(NamedTuple):
 
     def allows(self, following: Self, bounds: MotionBounds) -> Mask:
         """Joints that may make that step: differences within bounds, and it can be stopped."""
-        limits = bounds.arrays
+        limits = limit_arrays(bounds)
         position, velocity, acceleration = following.motion
         size = np.abs(acceleration)
         last = following.dt_before
@@ -285,7 +286,7 @@ class Moment(NamedTuple):
 
     def generated(self, exact: Self, asked: Mask, bounds: MotionBounds) -> Self:
         """That step, with the joints that are asked on the fastest way to it."""
-        limits, joint = bounds.arrays, np.nonzero(asked)[-1]
+        limits, joint = limit_arrays(bounds), np.nonzero(asked)[-1]
         rates = np.stack((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
         target, before = (
             np.clip(np.rint(x[asked] * GRID) / GRID, limits.lower[joint], limits.upper[joint])
@@ -319,7 +320,7 @@ class Moment(NamedTuple):
 
         They are of the N joints that are asked.
         """
-        limits, here, joint = bounds.arrays, self.motion[0][asked], np.nonzero(asked)[-1]
+        limits, here, joint = limit_arrays(bounds), self.motion[0][asked], np.nonzero(asked)[-1]
         # a joint outside its limits may stay as far out as it is, and come back
         low = np.minimum(limits.lower[joint], here) - ROUNDING
         high = np.maximum(limits.upper[joint], here) + ROUNDING

@@ -18,8 +18,8 @@ from ruckig import (
     Trajectory,
 )
 
+from tpgmm_control.motion.limit_arrays import ENDLESS
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.motion.motion_bounds import ENDLESS
 
 __all__ = ["braked_part", "first_part", "rest_positions", "stopping_range"]
 

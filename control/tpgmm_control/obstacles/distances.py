@@ -228,7 +228,7 @@ def _of_links(robot: Robot, links: Sequence[str]) -> tuple[Robot | None, list[in
     config = robot.config()
     apart = set(config["coordinates"])
     joints = [name for name in config["joints"] if name not in apart]
-    still = dict.fromkeys((n for n in robot.model.actuated if n in apart), 0.0)
+    still = dict.fromkeys((n for n in robot.model.actuated_joints if n in apart), 0.0)
     changed = {"links": [*links], "joints": joints, "coordinates": [], "tools": {}}
     changed |= {"locked": {**config["locked"], **still}, "dtype": "float64"}
     columns = [config["joints"].index(name) for name in joints] if apart else slice(None)

@@ -22,7 +22,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.robots.mjcf import compiled
+from tpgmm_torch.robots.mjcf import compile_mjcf
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
@@ -118,7 +118,7 @@ class Scene:
         self.closer: Mapping[Pair, float] = MappingProxyType({})
         why: dict[Pair, str] = {}
         if isinstance(obstacles, str | os.PathLike):
-            model = compiled(obstacles, "the obstacles")
+            model = compile_mjcf(obstacles, "the obstacles")
             obstacles = list(solids(model, links, base, visuals))
             why = dict.fromkeys(map(_pair, excluded(model)), "excluded")
         own = [one for one in obstacles if one.carrier in links]
@@ -229,7 +229,7 @@ class Scene:
         """
         least: dict[Pair, float] = {}
         for one in demonstrations:
-            chosen = one.reordered(self.robot.joint_names)
+            chosen = one.reorder(self.robot.joint_names)
             state, frames = held_objects(
                 self.robot.state(chosen.joints), one.time, one.frames, one.holds or ()
             )
@@ -341,7 +341,9 @@ def _own(
     links = robot.model.links
     if parse_xml(text).tag == "mujoco":
         assert geometry is not None
-        found = solids(compiled(geometry, "the robot"), links, robot.config()["base"], visuals)
+        found = solids(
+            compile_mjcf(geometry, "the robot"), links, robot.config()["base"], visuals
+        )
     else:
         if geometry is not None and not is_text(geometry) and meshes is None:
             meshes = Path(geometry).parent

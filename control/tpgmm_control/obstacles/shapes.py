@@ -14,7 +14,7 @@ import numpy as np
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.mjcf import compiled, mujoco_module
+from tpgmm_torch.robots.mjcf import compile_mjcf, mujoco_module
 from tpgmm_torch.robots.urdf import free_name, parse_xml
 
 __all__ = ["Shape", "excluded", "solids", "urdf_solids"]
@@ -253,7 +253,7 @@ def urdf_solids(text: str, meshes: Path | None, visuals: bool) -> list[Shape]:
             + (", only visuals: visuals=True takes these" if seen else "")
             + "; or give the file that has it, geometry='robot.xml'"
         )
-    model = compiled(ElementTree.tostring(flat, encoding="unicode"), "the robot")
+    model = compile_mjcf(ElementTree.tostring(flat, encoding="unicode"), "the robot")
     return [replace(one, carrier=one.name) for one in solids(model, list(links), root, True)]
 
 

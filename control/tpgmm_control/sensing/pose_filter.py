@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from tpgmm_torch.constraints import check_positive
+from tpgmm_control.sensing.states import check_positive
 from tpgmm_torch.data.frames import LEVER
 
 __all__ = ["OneEuro", "PoseFilter"]

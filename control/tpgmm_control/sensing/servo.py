@@ -24,8 +24,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.states import changed
 
 __all__ = ["Flags", "Servo"]
 
@@ -174,7 +174,7 @@ class Servo:
         each = self.each + share * (_median(gaps) - self.offset - self.each)
         each = np.where(known, each, 0.0)
         wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
-        new = changed(
+        new = replace_fields(
             self,
             first=reference + left * behind,
             second=second,
@@ -208,7 +208,7 @@ class Servo:
         shortest = possible.argmax(0)
         own = np.abs(reference - shortest.choose(self.second))
         lead = np.abs(shortest.choose(self.each)) / (floor + MODEL_ERROR * own)
-        return changed(self, usual=usual, excess=beyond / usual, lead=lead)
+        return replace_fields(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
         self, reference: Array, motion: Array, ran: Array, dt: Array, learns: Flags
@@ -233,7 +233,7 @@ class Servo:
         before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
         gain = learns * before * dt / (before * dt + noise)
         step = gain * self.gap
-        return changed(
+        return replace_fields(
             self,
             score=score,
             offset=self.offset + step,
@@ -244,7 +244,7 @@ class Servo:
 
     def with_offsets(self, joints: Flags) -> Self:
         """The gaps of some joints (B, n_joints) are offsets."""
-        return changed(
+        return replace_fields(
             self.moving_on(joints),
             offset=np.where(joints, self.offset + self.gap, self.offset),
             each=np.where(joints, self.each - self.gap, self.each),
@@ -261,7 +261,7 @@ class Servo:
         here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
         here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
         here |= {"gaps": self.offset, "each": 0 * self.gap, "gap": 0 * self.gap}
-        return changed(
+        return replace_fields(
             self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
         )
 
@@ -269,7 +269,7 @@ class Servo:
         """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
         motion = (self.weight * (self.second - self.slow)).sum(0)
         slow = np.where(joints, self.reading - motion, self.slow_reading)
-        return changed(self, slow_reading=slow)
+        return replace_fields(self, slow_reading=slow)
 
 
 def _median(three: Array) -> Array:

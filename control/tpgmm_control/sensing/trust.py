@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_torch.constraints import check_positive
-from tpgmm_torch.data.states import changed
+from tpgmm_control.sensing.states import check_positive, replace_fields
 
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
 
@@ -157,7 +156,9 @@ class Reading:
             change = np.abs(seen - self.value)
             if (change <= self._small_change()).all() and not self._faults(seen).any():
                 none = self.jumped & False
-                return changed(self, value=seen, same_for=same_for, jumped=none, pending=none)
+                return replace_fields(
+                    self, value=seen, same_for=same_for, jumped=none, pending=none
+                )
         with np.errstate(invalid="ignore"):
             fault = self._faults(seen)
             known = np.maximum(np.minimum(self.age, self.trust.settling_time), self.lost_for)
@@ -172,7 +173,7 @@ class Reading:
         jumped = settled & lives & self._small(seen)
         accepted = near | jumped
         jumped |= near & (self.fault == JUMPED) & stays
-        return changed(
+        return replace_fields(
             self,
             value=np.where(accepted[..., None], seen, self.value),
             age=np.where(accepted, 0.0, self.age + dt),
@@ -188,7 +189,7 @@ class Reading:
 
     def accept(self, robots: Mask) -> Self:
         """The readings to which the signal of some robots has jumped."""
-        return changed(
+        return replace_fields(
             self,
             value=np.where(robots[..., None], self.rival, self.value),
             age=np.where(robots, 0.0, self.age),
@@ -288,7 +289,7 @@ class PoseReading(Reading):
             return new
         flipped &= ~self._small(seen)
         kept = np.concatenate((seen[..., :3], new.value[..., 3:]), -1)
-        return changed(
+        return replace_fields(
             new,
             value=np.where(flipped[..., None], kept, new.value),
             fault=np.where(flipped, FLIPPED, new.fault).astype(np.int8),

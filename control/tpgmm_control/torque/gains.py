@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpgmm_torch.constraints import check_positive
+from tpgmm_control.sensing.states import check_positive
 
 __all__ = ["TorqueGains"]
 

@@ -15,7 +15,7 @@ from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.training import in_order, unit_findings
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot
@@ -163,11 +163,11 @@ def _check_phases(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
             )
         lost = sorted({*range(len(episodes))} - phases.keys())
         if lost and len(lost) < len(phases):
-            places.append(f"{name!r} missing in {listed([*map(str, lost)])}")
+            places.append(f"{name!r} missing in {shorten_list([*map(str, lost)])}")
             odd += lost
         about.update(odd)
     if places:
-        message = f"events are not where they usually are: {listed(places)}"
+        message = f"events are not where they usually are: {shorten_list(places)}"
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
 
 
@@ -182,7 +182,7 @@ def _check_order(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
             ahead, order = sorted(both.keys() - {*ahead}), (second, first)
         if 0 < len(ahead) <= len(both) / 4:
             message = f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
-            these = listed([str(i) for i in ahead])
+            these = shorten_list([str(i) for i in ahead])
             yield Finding("events", message + these, BY_HAND, order, tuple(ahead))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from tpgmm_datasets.checks.places import report_at
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
-from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import FAR, IMPOSSIBLE, ranges
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.pose_names import is_gripper, pose_groups, quaternion_groups
@@ -102,7 +102,7 @@ def _check_idle(
     in_poses = {i for group in pose_groups(names).values() for i in group}.union(quaternion)
     idle = [n for i, n in enumerate(names) if moved[i] <= UNMOVED and i not in in_poses]
     if idle:
-        message = f"joints never move, in any demonstration: {listed(idle)}"
+        message = f"joints never move, in any demonstration: {shorten_list(idle)}"
         remedy = "Were they recorded? Leave out those that the skill does not need"
         yield Finding("still", message, remedy, tuple(idle))
 
@@ -134,10 +134,12 @@ def _check_speeds(
     odd, about = np.flatnonzero(over.any(axis=0)), np.flatnonzero(over.any(axis=1)).tolist()
     if len(odd):
         most = fastest.max(axis=0)
-        places = listed([f"{names[j]!r} {most[j]:.3g}, limit {velocity[j]:.3g}" for j in odd])
+        places = shorten_list(
+            [f"{names[j]!r} {most[j]:.3g}, limit {velocity[j]:.3g}" for j in odd]
+        )
         message = (
             f"joints move faster than the robot can, up to [rad/s or m/s]: {places} "
-            f"(demonstrations {listed([str(i) for i in about])})"
+            f"(demonstrations {shorten_list([str(i) for i in about])})"
         )
         remedy = "Is time in seconds, are values lost, or did warping squeeze a motion?"
         yield Finding("speed", message, remedy, tuple(names[j] for j in odd), tuple(about))
@@ -173,7 +175,7 @@ def _check_plateaus(
                 ends.setdefault((names[joint], value), []).append(index)
     if odd := {end: indices for end, indices in ends.items() if len(indices) > 1}:
         places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
-        message = f"motions stop dead at one value and go on from it: {listed(places)}"
+        message = f"motions stop dead at one value and go on from it: {shorten_list(places)}"
         remedy = "Was the recording cut off at a limit, or a sensor saturated?"
         about = sorted(set().union(*odd.values()))
         joints = dict.fromkeys(name for name, _ in odd)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from math import nan
 
-from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.report import Finding, shorten_list
 
 __all__ = ["report_at"]
 
@@ -31,4 +31,4 @@ def report_at(
             tuple(dict.fromkeys(part)) for part in zip(*places, strict=True)
         )
         about = tuple(filter(None, names))
-        yield Finding(check, f"{message} {listed(texts)}", remedy, about, episodes, value)
+        yield Finding(check, f"{message} {shorten_list(texts)}", remedy, about, episodes, value)

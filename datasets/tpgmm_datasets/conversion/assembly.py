@@ -227,7 +227,7 @@ class Assembly:
         if self.rate is not None:
             demonstration = resample(demonstration, self.rate)
         if self.robot is not None:
-            demonstration = demonstration.reordered(self.robot.joint_names)
+            demonstration = demonstration.reorder(self.robot.joint_names)
         return demonstration
 
     def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:

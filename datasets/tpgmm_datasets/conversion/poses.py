@@ -17,7 +17,7 @@ from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.tables import numbers, read_table
 from tpgmm_torch import quaternions
-from tpgmm_torch.checks.report import listed
+from tpgmm_torch.checks.report import shorten_list
 from tpgmm_torch.checks.training import FAR
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
@@ -259,7 +259,7 @@ class MeasuredPoses:
             raise DatasetError(
                 f"frame {name!r} is a feature's name, a table of poses, LINK@EVENT, FramePose, "
                 "LinkPose, a Frame for all, or one for each of the episodes that are read, "
-                f"{listed([*map(str, wanted)])}, in a list or {{episode: Frame}}; got "
+                f"{shorten_list([*map(str, wanted)])}, in a list or {{episode: Frame}}; got "
                 f"{type(frames).__name__} of {len(given)} {', '.join(sorted(kinds))}"
             )
         return cls(several)
@@ -282,7 +282,7 @@ class MeasuredPoses:
                     "from the start of each"
                 )
                 raise DatasetError(message, **where)
-            pose = pose.resampled(measured, torch.from_numpy(time))
+            pose = pose.resample(measured, torch.from_numpy(time))
         if pose.batch_shape not in ((), (len(time),)):
             counts = f"{len(pose.position)} poses, the episode {len(time)} steps"
             raise DatasetError(f"frame {name!r} has {counts}", **where)
@@ -292,7 +292,7 @@ class MeasuredPoses:
 def _check_episodes(episodes: Array, known: Collection[int]) -> None:
     if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
         there = f"{min(known)} to {max(known)}, as 'tpgmm dataset info' counts"
-        raise DataError(f"rows are for episodes {listed(strange)}, the set has {there}")
+        raise DataError(f"rows are for episodes {shorten_list(strange)}, the set has {there}")
 
 
 def _read_poses(rows: pd.DataFrame, used: Mapping[str, tuple[str, float]]) -> Frame:
@@ -450,7 +450,7 @@ class LinkPose:
     def frame(self, demonstration: Demonstration, robot: Any, time: float) -> Frame:
         """Compute the pose of the link, or of the object in it, nearest to ``time``."""
         step = int((demonstration.time - time).abs().argmin())
-        state = robot.state(demonstration.reordered(robot.joint_names).joints[step])
+        state = robot.state(demonstration.reorder(robot.joint_names).joints[step])
         pose = Frame(state.position(self.link), state.orientation(self.link))
         if self.offset is not None:
             return pose.compose(self.offset.to(pose.position))

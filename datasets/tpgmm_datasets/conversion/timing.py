@@ -114,6 +114,6 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     return replace(
         demonstration.at_steps(kept),
         time=time[kept] - first,
-        holds=holds and tuple(hold.retimed(lambda at: at - first) for hold in holds),
+        holds=holds and tuple(hold.retime(lambda at: at - first) for hold in holds),
         events={n: min(max(at, first), last) - first for n, at in demonstration.events.items()},
     )

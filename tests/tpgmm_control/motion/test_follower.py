@@ -7,7 +7,7 @@ import torch
 from tpgmm_control.motion.follower import Follower
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 DT = 0.01
 ROBOT = JointSpace(["a", "b", "c"])

@@ -11,7 +11,7 @@ from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.trust import Trust
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 DT = 0.02
 ROBOT = JointSpace(["a", "b"])

@@ -8,7 +8,7 @@ import torch
 from tpgmm_datasets import check
 from tpgmm_torch import Demonstration
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 TIME = np.arange(100) / 50
 

@@ -139,7 +139,7 @@ def test_joints_of_a_robot_are_chosen_in_its_order(shaking, tmp_path):
     ):
         names = [name for name in before.joint_names if name.startswith("r_")]
         assert list(found.joint_names) == names
-        assert_equal([found.joints], [before.reordered(names).joints])
+        assert_equal([found.joints], [before.reorder(names).joints])
         assert list(found.frames) == ["held"]
 
 

@@ -148,13 +148,13 @@ class Backwards(Alignment):
 def test_an_alignment_of_ones_own_only_finds_paths():
     first, second = moving(5), moving(7)
     alignment = Backwards()
-    aligned = alignment.fit_transform([first, second.reordered(["b", "a"])])
+    aligned = alignment.fit_transform([first, second.reorder(["b", "a"])])
     for one, own in zip(aligned, (first, second), strict=True):
         assert one.joint_names == ("a", "b")
         assert torch.equal(one.time, alignment.time_)
         expected = torch.stack((own.joints[-2:].mean(0), own.joints[-1]))
         torch.testing.assert_close(one.joints, expected)
-    again = alignment.transform([second.reordered(["b", "a"])])
+    again = alignment.transform([second.reorder(["b", "a"])])
     assert torch.equal(again[0].joints, aligned[1].joints)
     assert not alignment.__sklearn_tags__().input_tags.two_d_array
 

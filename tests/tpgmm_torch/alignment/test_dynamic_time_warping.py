@@ -49,7 +49,7 @@ def linear():
 
 
 @pytest.fixture(scope="module", params=["joints", "robot", "barycenter"])
-def warped(request):
+def warped_pair(request):
     transformer = DynamicTimeWarping(
         "barycenter" if request.param == "barycenter" else "medoid",
         robot=Arm() if request.param == "robot" else None,
@@ -57,33 +57,33 @@ def warped(request):
     return transformer, transformer.fit_transform(DEMONSTRATIONS)
 
 
-def test_warping_lowers_the_spread_of_the_shake_tenfold(linear, warped):
-    before, after = spread_of_shake(linear[0].paths_), spread_of_shake(warped[0].paths_)
+def test_warping_lowers_the_spread_of_the_shake_tenfold(linear, warped_pair):
+    before, after = spread_of_shake(linear[0].paths_), spread_of_shake(warped_pair[0].paths_)
     assert after < before / 10
 
 
-def test_events_of_the_motion_come_together(linear, warped):
-    before, after = spread_of_events(linear[1]), spread_of_events(warped[1])
+def test_events_of_the_motion_come_together(linear, warped_pair):
+    before, after = spread_of_events(linear[1]), spread_of_events(warped_pair[1])
     # of the spread at the grasp the barycentre leaves 0.25, the medoid 0.15
     assert all(after[name] < 0.3 * before[name] for name in EVENTS)
     assert after["shake"] < 0.05 and after["rest"] < 0.05
 
 
-def test_all_results_share_one_increasing_clock(warped):
-    transformer, aligned = warped
+def test_all_results_share_one_increasing_clock(warped_pair):
+    transformer, aligned = warped_pair
     assert all(torch.equal(d.time, transformer.time_) for d in aligned)
     assert (transformer.time_.diff() > 0).all()
     assert transformer.time_.dtype == torch.float64
 
 
-def test_paths_increase_and_keep_both_ends(warped):
-    for path, demonstration in zip(warped[0].paths_, DEMONSTRATIONS, strict=True):
+def test_paths_increase_and_keep_both_ends(warped_pair):
+    for path, demonstration in zip(warped_pair[0].paths_, DEMONSTRATIONS, strict=True):
         assert (np.diff(path) > 0).all()
         assert path[[0, -1]] == pytest.approx(demonstration.time[[0, -1]].numpy(), abs=1e-9)
 
 
-def test_transform_repeats_what_fit_transform_gave(warped):
-    transformer, aligned = warped
+def test_transform_repeats_what_fit_transform_gave(warped_pair):
+    transformer, aligned = warped_pair
     for one, other in zip(transformer.transform(DEMONSTRATIONS[:3]), aligned, strict=False):
         torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-12)
 

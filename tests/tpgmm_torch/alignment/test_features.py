@@ -33,7 +33,7 @@ def test_nothing_to_align_by_is_an_error():
         DynamicTimeWarping().fit([still, still])
 
 
-def scaled(demonstrations, name, robot=None):
+def scale_units(demonstrations, name, robot=None):
     """The columns of one group."""
     features = AlignmentFeatures.fit(demonstrations, robot, [name])
     return [features(one) for one in demonstrations]
@@ -51,15 +51,15 @@ WEIGHTS = {"joints": 1.0, "speed": 5.0, "directions": 4.5, "hand": 1.0, "hand in
 @pytest.mark.parametrize("name, weight", WEIGHTS.items())
 def test_a_group_has_the_square_of_its_weight_as_variance(name, weight):
     family = DEMONSTRATIONS[:3]
-    assert variance(scaled(family, name, Arm())) == pytest.approx(weight**2)
+    assert variance(scale_units(family, name, Arm())) == pytest.approx(weight**2)
 
 
 def test_features_are_what_they_are_called():
     family = DEMONSTRATIONS[:2]
-    [joints, _] = scaled(family, "joints")
+    [joints, _] = scale_units(family, "joints")
     given = family[0].joints.numpy()
     np.testing.assert_allclose(joints / joints[500, 0], given / given[500, 0], rtol=1e-9)
-    seen = scaled(family, "hand in bottle", Arm())[0]
+    seen = scale_units(family, "hand in bottle", Arm())[0]
     frame = family[0].frames["bottle"]
     place = frame.inverse_transform(Arm().state(family[0].joints).position("hand")).numpy()
     moved = place.std(axis=0) > 1e-9
@@ -70,7 +70,7 @@ def test_directions_do_not_depend_on_the_speed_and_fade_out_at_standstill():
     time = np.linspace(0, 4, 401)
     # forth along (3, 4), a rest, and back at half the speed
     way = np.interp(time, [0, 1, 2, 4], [0, 1, 1, 0])
-    direction = scaled([Demonstration(time, np.outer(way, [3.0, 4.0]))], "directions")[0]
+    direction = scale_units([Demonstration(time, np.outer(way, [3.0, 4.0]))], "directions")[0]
     forth, rest, back = direction[50], direction[150], direction[300]
     np.testing.assert_allclose(forth[1] / forth[0], 4 / 3)
     np.testing.assert_allclose(rest, 0, atol=1e-9)
@@ -88,14 +88,14 @@ def test_quaternions_are_found_by_the_names_of_the_joints():
     poses = Poses(["hand"])
     assert quaternion_columns(own, poses) == [[3, 4, 5, 6]]
     names = own.joint_names
-    assert quaternion_columns(own.reordered(names[::-1]), poses) == [[3, 2, 1, 0]]
+    assert quaternion_columns(own.reorder(names[::-1]), poses) == [[3, 2, 1, 0]]
     plain = Demonstration(own.time, own.joints)
     assert quaternion_columns(plain, poses) == [[3, 4, 5, 6]]
     assert quaternion_columns(plain, None) == quaternion_columns(plain, Arm()) == []
     with pytest.raises(ShapeError, match="has 3 joints without names, the robot has 7"):
         quaternion_columns(Demonstration(time, np.ones((30, 3))), poses)
     with pytest.raises(UnknownNameError, match=r"'hand\.qw' is not in the demonstration"):
-        quaternion_columns(own.reordered(names[:3]), poses)
+        quaternion_columns(own.reorder(names[:3]), poses)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():
     usual = np.sqrt((1 + 0 + 0.25 + 0.25) / 4)
     for scale in (1.0, 100.0):
         moving = Demonstration(time, scale * np.outer(way, [0.6, 0.8]))
-        [speed] = scaled([moving], "speed")
+        [speed] = scale_units([moving], "speed")
         assert speed.shape == (401, 1)
         speed = speed[:, 0] / np.sqrt((speed**2).mean())
         np.testing.assert_allclose(

@@ -53,7 +53,7 @@ def test_no_duration_is_refused():
         LinearTimeNormalization("longest").fit([ramp(0, 1, 3)])
 
 
-def shown(begin=0.0, end=10.0, n=501, **events):
+def show(begin=0.0, end=10.0, n=501, **events):
     """Joints are the phase between the anchors: 0, 1, ... at start, events, end."""
     time = np.linspace(begin, end, n)
     anchors = [begin, *events.values(), end]
@@ -63,9 +63,9 @@ def shown(begin=0.0, end=10.0, n=501, **events):
 
 
 FAMILY = [
-    shown(close=2.0, open=8.0),
-    shown(5.0, 12.0, 401, close=9.0, open=10.0),
-    shown(0.0, 6.0, 301, close=3.0, open=4.5),
+    show(close=2.0, open=8.0),
+    show(5.0, 12.0, 401, close=9.0, open=10.0),
+    show(0.0, 6.0, 301, close=3.0, open=4.5),
 ]
 
 
@@ -89,7 +89,7 @@ def test_events_are_at_one_instant_and_each_part_is_stretched_evenly(duration):
 def test_others_are_aligned_onto_the_same_instants():
     transformer = EventAlignment(["close"]).fit(FAMILY)
     assert transformer.events_ == ("close",)
-    [one] = transformer.transform([shown(1.0, 4.0, close=1.5)])
+    [one] = transformer.transform([show(1.0, 4.0, close=1.5)])
     step = float(one.time[1])
     assert one.events["close"] == pytest.approx(transformer.instants_["close"], abs=step)
     again = clone(transformer).fit(FAMILY).transform(FAMILY[:1])[0]
@@ -107,8 +107,8 @@ def test_start_and_end_are_anchors_anyway():
 @pytest.mark.parametrize(
     "family, events, told",
     [
-        ([shown(close=2.0), shown(close=3.0), shown()], None, r"'close' is missing .*\[2\]"),
-        ([shown(), shown()], None, "no events to align at"),
+        ([show(close=2.0), show(close=3.0), show()], None, r"'close' is missing .*\[2\]"),
+        ([show(), show()], None, "no events to align at"),
         (FAMILY, ["grasp"], r"'grasp' is missing in demonstrations \[0, 1, 2\].*'close'"),
         (FAMILY, ["open", "close"], "'close' at 2 s is not after 'open' at 8 s in demon.* 0"),
         (
@@ -116,7 +116,7 @@ def test_start_and_end_are_anchors_anyway():
             None,
             "'open' at 2 s is not after 'close' at 4 s in demonstration 3",
         ),
-        ([shown(close=0.0), shown(close=1.0)], None, "'close' at 0 s is not after 'start'"),
+        ([show(close=0.0), show(close=1.0)], None, "'close' at 0 s is not after 'start'"),
     ],
 )
 def test_events_that_are_missing_or_out_of_order_are_refused(family, events, told):
@@ -124,7 +124,7 @@ def test_events_that_are_missing_or_out_of_order_are_refused(family, events, tol
         EventAlignment(events).fit(family)
 
 
-def paced(close, pace, seed=0):
+def make_paced(close, pace, seed=0):
     """A way whose speed differs between the anchors; the third joint says where on it."""
     time = np.linspace(0, 6, 301)
     part, fraction = np.divmod(np.interp(time, [0, close, 6], [0, 1, 2]), 1)
@@ -134,7 +134,7 @@ def paced(close, pace, seed=0):
     return Demonstration(time, joints, events={"close": close})
 
 
-PACES = [paced(2.0, 1.0, 1), paced(3.5, 1.5, 2), paced(2.8, 0.7, 3)]
+PACES = [make_paced(2.0, 1.0, 1), make_paced(3.5, 1.5, 2), make_paced(2.8, 0.7, 3)]
 
 
 def spread(aligned):

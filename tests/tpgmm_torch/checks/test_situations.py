@@ -19,7 +19,7 @@ def given(count=1):
     return [Situation(d.joints[0], d.frames) for d in few_bottles()[:count]]
 
 
-def learned():
+def learn_model():
     return bottle_model(3, tol=1e6).fit(few_bottles())
 
 
@@ -41,7 +41,7 @@ def test_a_batch_names_the_most_unlike_robot():
 
 
 def test_only_the_first_tick_is_checked_and_a_posture_only_at_the_start():
-    model, [one] = learned(), given()
+    model, [one] = learn_model(), given()
     bent = one.joints.clone()
     bent[4] += 1.2
     middle = float(model.time_[len(model.time_) // 2])
@@ -56,7 +56,7 @@ def test_only_the_first_tick_is_checked_and_a_posture_only_at_the_start():
 
 
 def test_a_saved_model_knows_its_demonstrations(tmp_path):
-    model, [one] = learned(), given()
+    model, [one] = learn_model(), given()
     save(model, tmp_path / "model")
     again = load_model(tmp_path / "model")
     assert again.summary_ == model.summary_
@@ -68,7 +68,7 @@ def test_a_saved_model_knows_its_demonstrations(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_trajectory_has_the_novelty_of_its_situation():
-    model, [one] = learned(), given()
+    model, [one] = learn_model(), given()
     away = Frame(one.frames["bottle"].position + 0.3, one.frames["bottle"].orientation)
     situations = [one, Situation(one.joints, {"bottle": away})]
     novelty = [t.novelty for t in model.predict(situations, candidates=False)]
@@ -79,7 +79,7 @@ def test_a_trajectory_has_the_novelty_of_its_situation():
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_command_has_the_novelty_of_the_situation_now():
-    model, [one] = learned(), given()
+    model, [one] = learn_model(), given()
     bottle = one.frames["bottle"]
     away = Frame(bottle.position + 0.3, bottle.orientation)
     controller = Controller(model.skill, one.joints.expand(2, -1), one.frames, trust=None)

@@ -14,12 +14,12 @@ from tpgmm_torch.checks import Region, TrainingSummary
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 SKILL = generator()
 
 
-def learned(places, starts, turns=None, kinematics=None) -> TrainingSummary:
+def summarise(places, starts, turns=None, kinematics=None) -> TrainingSummary:
     """A summary of demonstrations that stand still."""
     frames = Frame(places, turns)
     kinematics = kinematics or JointSpace(tuple(f"j{i}" for i in range(np.shape(starts)[1])))
@@ -39,9 +39,9 @@ def bottles(n: int, seed: int, width: float = 1.0) -> tuple[np.ndarray, Frame]:
     return starts, Frame(centre + (frame.position - centre) * width, turn)
 
 
-def shown(n: int, seed: int) -> TrainingSummary:
+def show(n: int, seed: int) -> TrainingSummary:
     starts, frame = bottles(n, seed)
-    return learned(frame.position, starts, frame.orientation)
+    return summarise(frame.position, starts, frame.orientation)
 
 
 @pytest.mark.parametrize("n", [5, 10, 20])
@@ -49,7 +49,7 @@ def test_situations_like_the_demonstrations_are_beyond_1_once_in_n_plus_1(n):
     beyond, warned = [], []
     for seed in range(60):
         starts, frame = bottles(50, seed + 100)
-        novelty = shown(n, seed).novelty(starts, {"cup": frame})
+        novelty = show(n, seed).novelty(starts, {"cup": frame})
         beyond.append((novelty > 1).mean())
         warned.append((novelty > 1.5).mean())
     assert np.mean(beyond) == pytest.approx(1 / (n + 1), abs=0.05)
@@ -61,21 +61,21 @@ def test_it_is_the_same_however_the_base_is_turned():
     new_starts, new = bottles(4, 1, width=2.0)
     base = quaternions.exp(torch.tensor([0.3, -1.0, 0.7], dtype=torch.float64))
 
-    def moved(pose: Frame) -> Frame:
+    def move(pose: Frame) -> Frame:
         turn = quaternions.product(base, pose.orientation)
         return Frame(quaternions.rotate(base, pose.position) + 0.4, turn)
 
-    here = learned(frame.position, starts, frame.orientation)
-    there = learned(moved(frame).position, starts, -moved(frame).orientation)
+    here = summarise(frame.position, starts, frame.orientation)
+    there = summarise(move(frame).position, starts, -move(frame).orientation)
     expected = here.novelty(new_starts, {"cup": new})
-    assert there.novelty(new_starts, {"cup": moved(new)}) == pytest.approx(expected, rel=1e-6)
+    assert there.novelty(new_starts, {"cup": move(new)}) == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_furthest_demonstration_sets_the_unit():
     starts = np.random.default_rng(0).normal(size=(7, 2))
     starts[3] = (2.0, 2.5)
     others = Region.of(np.delete(starts, 3, axis=0), "start")
-    summary = learned(np.zeros((7, 3)), starts)
+    summary = summarise(np.zeros((7, 3)), starts)
     assert summary.limit == pytest.approx(float(others.distance(starts[3])))
 
 
@@ -85,23 +85,23 @@ def test_one_odd_demonstration_does_not_make_far_objects_likely():
     apart, bent = places.copy(), starts.copy()
     apart[4, 0] += 0.5
     bent[4] += 1.0
-    for summary in (learned(apart, starts), learned(places, bent)):
+    for summary in (summarise(apart, starts), summarise(places, bent)):
         assert summary.limit == 2.0
         [finding] = summary.findings(starts[0], {"cup": Frame([4.0, 0.0, 0.0])})
         assert finding.check == "place" and "cup: x = 4, shown" in finding.message
 
 
 def test_few_or_equal_demonstrations_have_fixed_units():
-    two = learned(np.zeros((2, 3)), np.zeros((2, 2)))
+    two = summarise(np.zeros((2, 3)), np.zeros((2, 2)))
     edge = 0.05 * np.sqrt(3 + 2 * np.sqrt(6))  # a deviation of 5 cm
     assert float(two.novelty(None, {"cup": Frame([edge, 0, 0])})) == pytest.approx(1.0)
-    equal = learned(np.zeros((9, 3)), np.zeros((9, 2)))
+    equal = summarise(np.zeros((9, 3)), np.zeros((9, 2)))
     assert float(equal.novelty([0.0, 0.0], {"cup": Frame([0.005, 0, 0])})) < 1
     assert float(equal.novelty([0.0, 0.0], {"cup": Frame([0.1, 0, 0])})) > 3
 
 
 def test_two_unusual_things_are_newer_than_one_by_the_4_norm():
-    summary = learned(np.zeros((2, 3)), np.zeros((2, 2)))
+    summary = summarise(np.zeros((2, 3)), np.zeros((2, 2)))
     both = Frame([0.1, 0, 0], quaternions.exp(torch.tensor([0, 0, 0.7]).double()))
     place, turn = Frame([0.1, 0, 0]), Frame([0.0, 0, 0], both.orientation)
     one, other, two = (float(summary.novelty(None, {"cup": f})) for f in (place, turn, both))
@@ -110,7 +110,7 @@ def test_two_unusual_things_are_newer_than_one_by_the_4_norm():
 
 
 def test_unknown_frames_task_parameters_and_nan_do_not_count():
-    summary = shown(5, 0)
+    summary = show(5, 0)
     starts, frame = bottles(2, 1)
     known = summary.novelty(None, {"cup": frame})
     starts[:, 3] = np.nan
@@ -121,13 +121,13 @@ def test_unknown_frames_task_parameters_and_nan_do_not_count():
 def test_quaternions_among_joints_are_not_compared():
     hand = Poses(("hand",))
     starts = np.tile([0.0, 0, 0, 1, 0, 0, 0], (3, 1))
-    assert learned(np.zeros((3, 3)), starts, kinematics=hand).compared == [0, 1, 2]
+    assert summarise(np.zeros((3, 3)), starts, kinematics=hand).compared == [0, 1, 2]
 
 
 def test_a_coordinate_outside_is_named_with_its_range():
     places = np.random.default_rng(0).uniform([0.2, -0.1, 0.1], [0.4, 0.1, 0.2], (10, 3))
     starts = np.random.default_rng(1).uniform(-0.1, 0.1, (10, 2))
-    summary = learned(places, starts)
+    summary = summarise(places, starts)
     [finding] = summary.findings([0.0, 0.0], {"cup": Frame([0.3, 0.0, 0.45])}, "robot 4, ")
     low, high = places[:, 2].min(), places[:, 2].max()
     assert f"robot 4, cup: z = 0.45, shown {low:.4g} to {high:.4g}" in finding.message
@@ -138,7 +138,7 @@ def test_a_coordinate_outside_is_named_with_its_range():
 
 def test_a_place_beside_a_line_of_places_is_unlikely():
     along = np.linspace(0, 0.5, 12)[:, None] * [1.0, 1.0, 0.0]
-    summary = learned(along, np.zeros((12, 2)))
+    summary = summarise(along, np.zeros((12, 2)))
     assert summary.findings(None, {"cup": Frame([0.25, 0.25, 0.0])}) == []
     [finding] = summary.findings(None, {"cup": Frame([0.0, 0.5, 0.0])})
     assert "cup: beside those shown, at 0, 0.5, 0 m" in finding.message
@@ -147,7 +147,7 @@ def test_a_place_beside_a_line_of_places_is_unlikely():
 def test_orientations_count_by_their_angle_whatever_the_sign():
     axis = torch.tensor([0, 0, 1.0], dtype=torch.float64)
     turns = quaternions.exp(torch.linspace(-0.3, 0.3, 6).double()[:, None] * axis)
-    summary = learned(np.zeros((6, 3)), np.zeros((6, 2)), turns)
+    summary = summarise(np.zeros((6, 3)), np.zeros((6, 2)), turns)
     assert summary.findings(None, {"cup": Frame([0, 0, 0], -turns[1])}) == []
     [finding] = summary.findings(None, {"cup": Frame([0, 0, 0], [0, 1.0, 0, 0])})
     assert "turned by 180 deg" in finding.message and "(w, x, y, z)?" in finding.remedy
@@ -159,12 +159,12 @@ def test_a_frame_at_a_link_follows_from_the_start_posture():
     robot = upper_body()
     starts = SKILL.start_postures(4, np.random.default_rng(0))
     hands = robot.state(starts).pose("l_hand")
-    summary = learned(hands.position, starts, -hands.orientation, robot)
+    summary = summarise(hands.position, starts, -hands.orientation, robot)
     assert summary.frames["cup"].link == "l_hand"
     pose = summary.start_frames(starts[1], robot)["cup"]
     assert torch.allclose(pose.position, hands[1].position)
     assert summary.start_frames(starts[1], robot, given=["cup"]) == {}
-    beside = learned(hands.position + 1e-3, starts, hands.orientation, robot)
+    beside = summarise(hands.position + 1e-3, starts, hands.orientation, robot)
     assert beside.frames["cup"].link is None
 
 
@@ -205,7 +205,7 @@ def damages(config):
 
 
 def test_json_gives_it_back_and_damage_is_refused():
-    summary = shown(5, 0)
+    summary = show(5, 0)
     robot = JointSpace(summary.joint_names)
     config = json.loads(json.dumps(summary.config()))
     assert TrainingSummary.from_config(config, robot) == summary

@@ -23,7 +23,7 @@ from tpgmm_torch.checks import check
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 HAND = Poses(["hand"], orientation=False)
 PUT = RelativePosition("cup", "tray")
@@ -63,7 +63,7 @@ def test_joints_beyond_their_limits_by_a_turn_cannot_be():
     assert finding.check == "units" and finding.impossible and "degrees" in finding.remedy
 
 
-def limited():
+def limit_joints():
     """A robot whose last joint may not go where the others may."""
     robot = JointSpace(("a", "b", "c"))
     robot.lower = robot.lower.new_tensor([-1.2, -1.2, -0.2])
@@ -73,15 +73,15 @@ def limited():
 
 def test_joints_somewhat_beyond_their_limits_and_in_another_order_are_unlikely():
     shown = [replace(d, joint_names=None) for d in waves(3)]
-    assert found(shown, limited()) == []
+    assert found(shown, limit_joints()) == []
     swapped = [replace(d, joints=d.joints[:, [2, 1, 0]]) for d in shown]
-    [finding] = found(swapped, limited())
+    [finding] = found(swapped, limit_joints())
     assert finding.check == "order" and "0] would fit the joints" in finding.message
     beyond = [replace(d, joints=d.joints + 2.0, joint_names=SPACE.joint_names) for d in shown]
-    [finding] = found(beyond, limited())
+    [finding] = found(beyond, limit_joints())
     assert (finding.check, finding.impossible) == ("limits", False)
     assert set(finding.names) == {"a", "b", "c"}
-    model = TaskParameterizedGMM(2, [Canonical()], limited(), random_state=0)
+    model = TaskParameterizedGMM(2, [Canonical()], limit_joints(), random_state=0)
     with pytest.warns(PlausibilityWarning, match="order does not fit the limits"):
         model.fit(swapped)
 

@@ -94,22 +94,22 @@ def test_attributes_cannot_be_replaced(attribute):
 
 def test_reordered_moves_the_columns_and_keeps_the_rest():
     demo = demonstration()
-    turned = demo.reordered(["elbow", "shoulder"])
+    turned = demo.reorder(["elbow", "shoulder"])
     assert torch.equal(turned.joints, demo.joints[:, [1, 0]])
     assert turned.joint_names == ("elbow", "shoulder")
     assert (dict(turned.frames), turned.events) == (dict(demo.frames), demo.events)
-    assert torch.equal(turned.reordered(["shoulder", "elbow"]).joints, demo.joints)
-    assert torch.equal(demo.reordered(["elbow"]).joints, demo.joints[:, [1]])
+    assert torch.equal(turned.reorder(["shoulder", "elbow"]).joints, demo.joints)
+    assert torch.equal(demo.reorder(["elbow"]).joints, demo.joints[:, [1]])
 
 
 def test_reordered_without_names_trusts_the_order():
     demo = demonstration(joint_names=None)
-    assert demo.reordered(["elbow", "shoulder"]) is demo
+    assert demo.reorder(["elbow", "shoulder"]) is demo
 
 
 def test_reordered_names_the_joint_that_is_missing():
     with pytest.raises(UnknownNameError, match="joint 'wrist' is not in the demonstration; "):
-        demonstration().reordered(["elbow", "wrist"])
+        demonstration().reorder(["elbow", "wrist"])
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -156,13 +156,13 @@ def test_frames_that_move_keep_the_clock_they_were_recorded_on():
 def test_joints_of_a_situation_may_be_named():
     named = Situation({"elbow": 1, "shoulder": torch.tensor(0.5), "lift": 0.1})
     assert named.joint_names == ("elbow", "shoulder", "lift")
-    assert named.reordered(["shoulder", "elbow"]).joints.tolist() == [0.5, 1.0]
+    assert named.reorder(["shoulder", "elbow"]).joints.tolist() == [0.5, 1.0]
     twin = pickle.loads(pickle.dumps(named))
     assert twin.joint_names == named.joint_names
     with pytest.raises(UnknownNameError, match="joint 'wrist' is not in the situation; it has"):
-        named.reordered(["wrist"])
+        named.reorder(["wrist"])
     unnamed = Situation([0.0, 1.0])
-    assert unnamed.reordered(["a", "b"]) is unnamed
+    assert unnamed.reorder(["a", "b"]) is unnamed
 
 
 def test_without_time_frames_per_step_have_one_length():

@@ -62,7 +62,7 @@ def starting(means, covariances, weights=None):
     return BlockGaussianMixture.from_parameters(weights, means, covariances)
 
 
-def refitted(model, X, start, *categories):
+def refit(model, X, start, *categories):
     with warnings.catch_warnings():
         for category in categories or (ConvergenceWarning,):
             warnings.simplefilter("ignore", category)
@@ -101,7 +101,7 @@ def test_one_block_equals_scikit_learn(clusters, start, covariance_type, n_iter)
         variance = variance.mean()
     # scikit-learn's regularisation is in squared units of the data
     model = BlockGaussianMixture(3, reg_covar=1e-6 / variance, **settings)
-    refitted(model, clusters, starting(means, covariances, weights))
+    refit(model, clusters, starting(means, covariances, weights))
     fitted(reference, clusters, ScikitLearnWarning)
     expected = {
         "full": lambda c: c,
@@ -166,7 +166,7 @@ def test_the_best_of_several_starts_wins(clusters, init_params):
 def test_em_goes_on_from_a_mixture(clusters):
     settings = {"n_components": 3, "blocks": WIDTHS, "tol": 0.0}
     half = fitted(BlockGaussianMixture(**settings, max_iter=4), clusters)
-    parts = refitted(BlockGaussianMixture(**settings, max_iter=4), clusters, half)
+    parts = refit(BlockGaussianMixture(**settings, max_iter=4), clusters, half)
     whole = fitted(BlockGaussianMixture(**settings, max_iter=8), clusters)
     torch.testing.assert_close(parts.means_, whole.means_)
     torch.testing.assert_close(parts.covariances_, whole.covariances_)
@@ -201,7 +201,7 @@ def test_a_component_on_a_single_point_is_reseeded(clusters):
     begin = starting(means, np.stack([wide, wide, tiny]), np.array([0.45, 0.45, 0.1]))
     model = BlockGaussianMixture(3, random_state=0)
     with pytest.warns(DegenerateComponentWarning, match=r"\[2\] in iteration 1"):
-        refitted(model, outlier, begin)
+        refit(model, outlier, begin)
     assert model.weights_[2] * 301 > 50
 
 
@@ -270,7 +270,7 @@ def test_adding_the_regularization_alone_can_lower_the_likelihood():
         precisions_init=np.linalg.inv(first.covariances_[0]),
     )
     fitted(reference, X, ScikitLearnWarning)
-    model = refitted(BlockGaussianMixture(**settings), X, first)
+    model = refit(BlockGaussianMixture(**settings), X, first)
     if hasattr(reference, "lower_bounds_"):  # since scikit-learn 1.7
         assert np.diff(reference.lower_bounds_).min() < -1e-6
     assert np.diff(model.lower_bounds_).min() > -1e-12
@@ -404,7 +404,7 @@ def grouped_data(n_groups: int = 45, group: int = GROUP, seed: int = 0) -> np.nd
 
 def fit_grouped(X: np.ndarray, start=None, **options) -> BlockGaussianMixture:
     model = BlockGaussianMixture(**{"n_components": K, "blocks": WIDTHS, **options})
-    return refitted(model, X, start, ConvergenceWarning, DegenerateComponentWarning)
+    return refit(model, X, start, ConvergenceWarning, DegenerateComponentWarning)
 
 
 def from_rows(X: np.ndarray) -> tuple[list, list]:

@@ -27,7 +27,7 @@ from tpgmm_torch.mixture.expectation_maximization import (
     expectation_maximization,
     log_joint,
     m_step,
-    reseed,
+    restart_components,
 )
 
 K = 8
@@ -61,11 +61,11 @@ def time_runs_backwards_in_the_other_block():
     return X
 
 
-def shuffled():
+def shuffle():
     return np.random.RandomState(0).permutation(movements())
 
 
-DATA = [movements, badly_scaled, nearly_singular, constant_time, outliers, shuffled,
+DATA = [movements, badly_scaled, nearly_singular, constant_time, outliers, shuffle,
         time_runs_backwards_in_the_other_block]  # fmt: skip
 
 
@@ -97,20 +97,20 @@ def test_all_families_and_groups_equal_the_reference(covariance_type, group_size
         assert_same_mixture(parameters, expected)
 
 
-def evaluated(monkeypatch):
+def evaluate(monkeypatch):
     """How many components each chunk was evaluated for, in a list that grows."""
     counts = []
 
-    def counted(blocks, maps, peaks, group_size=1):
+    def count_call(blocks, maps, peaks, group_size=1):
         counts.append(len(peaks))
         return log_joint(blocks, maps, peaks, group_size)
 
-    monkeypatch.setattr(em, "log_joint", counted)
+    monkeypatch.setattr(em, "log_joint", count_call)
     return counts
 
 
 def test_along_time_most_components_are_left_out(monkeypatch):
-    counts = evaluated(monkeypatch)
+    counts = evaluate(monkeypatch)
     points = points_of(movements())
     parameters = binned(points, family(), 20)
     least = e_step(parameters, points).least
@@ -126,7 +126,7 @@ def test_a_wrong_guess_is_noticed(shift, monkeypatch):
     start = binned(points, lambdas, 20)
     least = e_step(start, points).least
     moved = Parameters(start.weights, tuple(m + shift for m in start.means), start.covariances)
-    counts = evaluated(monkeypatch)
+    counts = evaluate(monkeypatch)
     gated = e_step(moved, points, least)
     assert (len(counts) > len(least)) == (shift == 0.5)
     dense = e_step(moved, points)
@@ -251,7 +251,9 @@ def test_dead_components_start_at_badly_explained_points(group_size):
     order = reference_joint(parameters, columns(points), group_size).logsumexp(1).argsort()
     ranks = []
     for seed in range(30):
-        found = reseed(parameters, dead, parameters, points, np.random.RandomState(seed))
+        found = restart_components(
+            parameters, dead, parameters, points, np.random.RandomState(seed)
+        )
         places = torch.cat(found.means, 1)
         torch.testing.assert_close(places[~dead], torch.cat(parameters.means, 1)[~dead])
         ranks += [int((rows[order] == place).all(1).nonzero()[0, 0]) for place in places[dead]]
@@ -275,7 +277,7 @@ def with_a_component_far_away(parameters):
     return Parameters(parameters.weights, tuple(means), parameters.covariances)
 
 
-def learned(start, points, lambdas, **settings):
+def learn(start, points, lambdas, **settings):
     rng = np.random.RandomState(0)
     return expectation_maximization(start, points, lambdas, rng, **{"tol": 0.0, **settings})
 
@@ -298,7 +300,7 @@ def test_bounds_are_counted_from_where_reseeding_lowered_them(measured, counted,
         return replace(e_step(*arguments), bound=next(bounds))
 
     monkeypatch.setattr(em, "e_step", given)
-    fit = learned(start, points, lambdas, max_iter=len(measured) - 1)
+    fit = learn(start, points, lambdas, max_iter=len(measured) - 1)
     assert fit.reseedings == ["component(s) [0] in iteration 1"]
     assert fit.bounds == counted
     assert (fit.n_iter, fit.converged) == (len(measured) - 1, False)
@@ -312,13 +314,13 @@ def test_a_step_that_lowers_the_likelihood_even_so_is_undone(monkeypatch):
     def given(*arguments):
         return replace(e_step(*arguments), bound=next(bounds))
 
-    def noted(expectation, family, *, floor):
+    def note_call(expectation, family, *, floor):
         floors.append(floor)
         return m_step(expectation, family, floor=floor)
 
     monkeypatch.setattr(em, "e_step", given)
-    monkeypatch.setattr(em, "m_step", noted)
-    fit = learned(start, points, lambdas, tol=1e-6, max_iter=10)
+    monkeypatch.setattr(em, "m_step", note_call)
+    fit = learn(start, points, lambdas, tol=1e-6, max_iter=10)
     assert floors == [False, True, True]
     assert fit.converged and fit.bounds == [-1.0, -1.0]
     assert_same_mixture(fit.parameters, start, 0)

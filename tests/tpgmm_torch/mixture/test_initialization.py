@@ -28,7 +28,7 @@ def test_bins_hold_all_points(n_bins):
         assert 0.2 < sizes.std() / (1000 / n_bins) < 0.4
 
 
-def labelled(times, sizes, group_size=1, sample=None):
+def label_points(times, sizes, group_size=1, sample=None):
     """Labels of all points, given in any order."""
     numbers = np.arange(len(times)) if sample is None else sample
     tensors = torch.from_numpy(times[numbers]), torch.from_numpy(numbers)
@@ -48,7 +48,7 @@ def test_bins_of_a_whole_sample_are_exact(distinct):
     sizes = [7, 1, 22, 30]
     expected = np.empty(60, dtype=int)
     expected[np.argsort(times, kind="stable")] = np.repeat(range(4), sizes)
-    np.testing.assert_array_equal(labelled(times, sizes), expected)
+    np.testing.assert_array_equal(label_points(times, sizes), expected)
 
 
 @pytest.mark.parametrize("distinct", [2, 10**9])
@@ -57,7 +57,7 @@ def test_bins_of_a_sample_hold_nearly_equal_parts(distinct):
     rng = np.random.RandomState(0)
     times = rng.randint(0, distinct, 20_000).astype(float)
     sample = np.sort(rng.choice(20_000, 2000, replace=False))
-    found = labelled(times, bin_sizes(2000, 8), sample=sample)
+    found = label_points(times, bin_sizes(2000, 8), sample=sample)
     np.testing.assert_allclose(np.bincount(found, minlength=8), 2500, rtol=0.15)
     order = np.lexsort((np.arange(20_000), times))
     assert (np.diff(found[order]) >= 0).all()

@@ -61,7 +61,7 @@ def test_bad_shares_are_refused_by_all_processes(tmp_path):
     done = torchrun(worker.__file__, "refused", tmp_path)
     assert done.returncode == 0, done.stderr
     expected = {
-        "empty": "no rows in process(es) [1] of 2",
+        "empty": "no rows, X is empty in process(es) [1] of 2",
         "columns": "have (5, 4) columns",
         "few": "n_components=9, but the data hold only 3 distinct",
         "none": "X is empty in process(es) [1] of 2",

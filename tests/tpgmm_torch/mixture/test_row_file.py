@@ -18,7 +18,7 @@ def small_pieces(monkeypatch):
 
 
 @pytest.fixture
-def timed():
+def timed_rows():
     """Rows with shared, unordered times in the first column, (5000, 5)."""
     rng = np.random.RandomState(3)
     time = rng.randint(0, 400, 5000) * 0.01
@@ -55,21 +55,21 @@ def test_it_is_indexed_like_an_array(dtype):
 
 @pytest.mark.parametrize("covariance_type", ["full", "tied", "diag", "spherical"])
 @pytest.mark.parametrize("init_params", ["time", "kmeans", "random"])
-def test_batches_give_the_mixture_of_the_whole(timed, init_params, covariance_type):
+def test_batches_give_the_mixture_of_the_whole(timed_rows, init_params, covariance_type):
     settings = SETTINGS | {"init_params": init_params, "covariance_type": covariance_type}
-    whole = fitted(BlockGaussianMixture(4, **settings), timed)
+    whole = fitted(BlockGaussianMixture(4, **settings), timed_rows)
     parts = fitted(
-        BlockGaussianMixture(4, **settings), RowFile.of(np.split(timed, [700, 701, 3000]))
+        BlockGaussianMixture(4, **settings), RowFile.of(np.split(timed_rows, [700, 701, 3000]))
     )
     assert_same(parts, whole)
     assert parts.n_features_in_ == 5
 
 
 @pytest.mark.parametrize("settings", [{"n_init": 3}, {"group_size": 4}, {"n_components": 1}])
-def test_starts_and_groups_are_those_of_the_whole(timed, settings):
+def test_starts_and_groups_are_those_of_the_whole(timed_rows, settings):
     settings = {"n_components": 5} | SETTINGS | settings
-    whole = fitted(BlockGaussianMixture(**settings), timed)
-    batches = (torch.from_numpy(part) for part in np.split(timed, [0, 801, 1600, 4004]))
+    whole = fitted(BlockGaussianMixture(**settings), timed_rows)
+    batches = (torch.from_numpy(part) for part in np.split(timed_rows, [0, 801, 1600, 4004]))
     assert_same(fitted(BlockGaussianMixture(**settings), RowFile.of(batches)), whole)
 
 
@@ -89,8 +89,8 @@ def with_nan(piece):
         (lambda piece: None, DataError, "batch 2: "),
     ],
 )
-def test_a_bad_batch_is_named(timed, spoil, error, message):
-    pieces = np.split(timed, [500, 1000, 2000])
+def test_a_bad_batch_is_named(timed_rows, spoil, error, message):
+    pieces = np.split(timed_rows, [500, 1000, 2000])
     pieces[2] = spoil(pieces[2])
     with pytest.raises(error, match=message):
         RowFile.of(iter(pieces))

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
 
 from tpgmm_torch import Demonstration
-from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
+from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 
 NAMES = ("a", "b")
 
@@ -48,15 +47,6 @@ def test_one_broken_demonstration_of_many_does_not_count():
     assert float(demonstrated_peaks([spoiled], NAMES)[0][0]) > 100
     shown = [spoiled, *(swing(1 + 0.01 * k) for k in range(10))]
     assert 9 < float(demonstrated_peaks(shown, NAMES)[0][0]) < 10
-
-
-def test_batches_pass_unchanged_and_count_together():
-    first, second = [swing(0.1), swing(0.2)], [swing(0.9)]
-    peaks = DemonstratedPeaks(NAMES)
-    assert list(peaks.watch([first, second])) == [first, second]
-    together = demonstrated_peaks([*first, *second], NAMES)
-    for one, other in zip(peaks.result(), together, strict=True):
-        assert torch.equal(one, other)
 
 
 def test_what_is_too_short_tells_nothing():

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tests.support.mixtures import assert_close
-from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 
 def test_minimum_jerk_goes_from_zero_to_one():
@@ -18,8 +18,3 @@ def test_minimum_jerk_is_at_rest_at_both_ends():
     for _ in range(2):
         [value] = torch.autograd.grad(value.sum(), u, create_graph=True)
         assert_close(value.detach(), np.zeros(2))
-
-
-def test_a_small_gap_fades_sooner_than_a_large_one():
-    gaps = torch.tensor([[0.0, 0.001], [0.0, -0.0075], [0.02, 0.5]], dtype=torch.float64)
-    assert_close(fading_time(gaps, 0.5), [0.05, 0.25, 0.5])

@@ -10,7 +10,7 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, MissingLimitsWarning, ShapeError, UnknownNameError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 ROBOT = JointSpace(["a", "b"])
 

@@ -28,7 +28,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 
 class CanonicalLaws(OperatorLaws):

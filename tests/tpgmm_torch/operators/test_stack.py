@@ -17,7 +17,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 
 
 class BothHandsLaws(RelativeLaws, OrientationLaws):

@@ -1,5 +1,6 @@
 """States of robots as tensors, and robots of a user's own."""
 
+import copy
 import math
 import re
 from typing import Any
@@ -15,7 +16,7 @@ from tests.support.robot_zoo import assert_differences_agree, random_joints, upp
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import RobotState
-from tpgmm_torch.robots.kinematics import checked_dtype
+from tpgmm_torch.robots.kinematics import JointSpace, parse_dtype
 
 #: A grasp.
 CUP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
@@ -97,14 +98,14 @@ class TestState:
             state.position("cup")
 
 
-def carried(joints: torch.Tensor, **options: Any) -> RobotState:
+def carry(joints: torch.Tensor, **options: Any) -> RobotState:
     return upper_body().state(joints).with_link("cup", "r_hand", CUP, **options)
 
 
 class TestObjects:
     def test_an_object_is_where_the_link_has_it(self) -> None:
         joints = random_joints(upper_body(), 5)
-        state, hand = carried(joints), upper_body().state(joints)
+        state, hand = carry(joints), upper_body().state(joints)
         where = Frame(hand.position("r_hand"), hand.orientation("r_hand"))
         torch.testing.assert_close(state.position("cup"), where.transform(CUP.position))
         matrix = quaternions.to_matrix(where.orientation) @ quaternions.to_matrix(
@@ -117,9 +118,9 @@ class TestObjects:
 
     def test_its_jacobian_is_the_derivative_of_its_pose(self) -> None:
         joints, size = random_joints(upper_body(), 4), 1e-6
-        state = carried(joints)
+        state = carry(joints)
         for column, unit in enumerate(torch.eye(17, dtype=torch.float64)):
-            ahead, behind = carried(joints + size * unit), carried(joints - size * unit)
+            ahead, behind = carry(joints + size * unit), carry(joints - size * unit)
             velocity = (ahead.position("cup") - behind.position("cup")) / (2 * size)
             back = quaternions.conjugate(behind.orientation("cup"))
             turn = quaternions.product(ahead.orientation("cup"), back)
@@ -146,16 +147,16 @@ class TestObjects:
         assert (state.position("cup")[1] == free.position).all()
         assert (state.orientation("cup")[1] == free.orientation).all()
         assert (state.jacobians[1, 2] == 0).all()
-        torch.testing.assert_close(state[2].position("cup"), carried(joints[2]).position("cup"))
+        torch.testing.assert_close(state[2].position("cup"), carry(joints[2]).position("cup"))
 
     def test_what_stands_on_a_carried_object_is_carried_by_the_same_link(self) -> None:
-        state = carried(random_joints(upper_body())).with_link("spoon", "cup", CUP)
+        state = carry(random_joints(upper_body())).with_link("spoon", "cup", CUP)
         assert state.carrier("spoon") == state.carrier("r_hand") == 1
         assert state.carrier("l_hand") == 0
         direct = Frame(
             CUP.transform(CUP.position), quaternions.product(CUP.orientation, CUP.orientation)
         )
-        other = carried(state.joints).with_link("spoon", "r_hand", direct)
+        other = carry(state.joints).with_link("spoon", "r_hand", direct)
         torch.testing.assert_close(state.jacobians, other.jacobians)
         with_other_cup = other.with_link("cup", "l_hand", CUP)
         assert with_other_cup.links == ("l_hand", "r_hand", "spoon", "cup")
@@ -235,7 +236,40 @@ def test_joints_may_be_given_by_name(batch: tuple[int, ...]) -> None:
 
 
 def test_dtypes_go_by_name() -> None:
-    assert checked_dtype("float32") == checked_dtype(torch.float32) == torch.float32
+    assert parse_dtype("float32") == parse_dtype(torch.float32) == torch.float32
     for dtype in ("float16", torch.float16):
         with pytest.raises(DataError, match=r"one of \['float32', 'float64'\], got .*float16"):
-            checked_dtype(dtype)
+            parse_dtype(dtype)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_a_state_has_joints_and_no_link(batch):
+    state = JointSpace(["a", "b"]).state(torch.ones(*batch, 2))
+    assert torch.equal(state.joints, torch.ones(*batch, 2, dtype=torch.float64))
+    assert state.links == ()
+    assert state.positions.shape == (*batch, 0, 3)
+    assert state.orientations.shape == (*batch, 0, 4)
+    assert state.jacobians.shape == (*batch, 0, 6, 2)
+
+
+def test_nothing_is_limited():
+    space = JointSpace(["a", "b"], torch.float32)
+    assert space.lower.tolist() == [-torch.inf] * 2
+    assert space.upper.tolist() == space.velocity.tolist() == [torch.inf] * 2
+    assert space.lower.dtype == space.upper.dtype == space.velocity.dtype == torch.float32
+    assert space.state([1.0, 2.0]).joints.dtype == torch.float32
+
+
+def test_its_names_are_all_of_it():
+    space = JointSpace(("a", "b"))
+    assert space.joint_names == ("a", "b")
+    assert JointSpace.from_config(space.config()) == space == copy.deepcopy(space)
+    assert hash(JointSpace.from_config(space.config())) == hash(space)
+    assert space != JointSpace(("b", "a"))
+    assert space != ("a", "b")
+    assert repr(space) == "JointSpace(2 joints)"
+
+
+def test_other_numbers_of_joints_are_refused():
+    with pytest.raises(ShapeError, match=r"\['a', 'b'\], got \(3,\)"):
+        JointSpace(("a", "b")).state(torch.zeros(3))

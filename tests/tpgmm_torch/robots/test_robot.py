@@ -30,34 +30,35 @@ from tests.support.robot_zoo import (
     upper_body,
     zoo,
 )
-from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
+from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots import robot as robot_module
-from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.robots.urdf import read_urdf
 
 
-def published() -> list[Any]:
+def published_files() -> list[Any]:
     """The URDFs of a public collection of which something moves; one file of it is empty."""
     files = sorted(G1_PATH.parents[2].rglob("*.urdf"))
     moves = re.compile(rb'type="(revolute|continuous|prismatic)"')
     return [pytest.param(f, id=f.stem) for f in files if moves.search(f.read_bytes())]
 
 
-@pytest.mark.parametrize("file", published())
+@pytest.mark.parametrize("file", published_files())
 def test_published_robots_are_where_pinocchio_has_them(file: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)
         model = read_urdf(file)
         links = random.Random(0).sample(model.links, min(3, len(model.links)))
         robot = Robot.from_urdf(file, links)
-    leaders = {name: model.leader(name) for name in model.movable if name not in model.actuated}
+    leaders = {
+        name: model.leader(name) for name in model.movable if name not in model.actuated_joints
+    }
     followers = {n: (on.joint, on.multiplier, on.offset) for n, on in leaders.items()}
     oracle = Pinocchio(pin.buildModelFromUrdf(str(file)), followers)
     joints = random_joints(robot)
@@ -433,14 +434,14 @@ class TestCombining:
 
     def test_joints_of_any_unit_have_no_limits_where_they_move_no_link(self) -> None:
         robot = zoo(("tip", "flange"))
-        free = robot.unlimited(robot.joint_names)
+        free = robot.drop_limits(robot.joint_names)
         assert [bool(x) for x in free.upper.isinf()] == [
             name == "grip" or bool(robot.upper[i].isinf())
             for i, name in enumerate(robot.joint_names)
         ]
         joints = random_joints(robot, 3)
         assert torch.equal(free.state(joints).jacobians, robot.state(joints).jacobians)
-        assert free == robot.unlimited(["grip"]) == Robot.from_config(free.config())
+        assert free == robot.drop_limits(["grip"]) == Robot.from_config(free.config())
 
 
 class TestErrors:
@@ -485,21 +486,3 @@ class TestErrors:
     def test_joints_that_are_not_finite(self, value: float) -> None:
         with pytest.raises(DataError, match="NaN or infinite"):
             zoo().state([0.0, value, 0.0, 0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("robot", "expected"),
-    [
-        (upper_body(), None),
-        (upper_body(coordinates=["l_grip", "r_grip", "lamp"]), ["l_grip", "r_grip"]),
-        (Robot.from_urdf(so101_urdf(), ["gripper_frame_link"], joints="*"), ["gripper"]),
-        (JointSpace(["elbow", "left_gripper"]), ["left_gripper"]),
-        (JointSpace(["left_gripper", "right_gripper"]), None),
-    ],
-)
-def test_joints_that_grip_are_named_so_and_move_no_link(robot, expected):
-    found = robot.gripping()
-    if expected is None:
-        assert found is None
-    else:
-        assert [robot.joint_names[i] for i in found.nonzero()] == expected

@@ -33,7 +33,7 @@ class TestReading:
         model = read_urdf(urdf(joint("two", "b", "c"), joint("one", "a", "b", kind="fixed")))
         assert (model.name, model.root, model.links) == ("r", "a", ("a", "b", "c"))
         assert [j.name for j in model.joints] == ["two", "one"]
-        assert model.actuated == ("two",)
+        assert model.actuated_joints == ("two",)
 
     def test_one_given_limit_sets_the_other_to_zero(self) -> None:
         (j,) = read_urdf(one('<limit upper="2" effort="1" velocity="3"/>')).joints
@@ -83,7 +83,7 @@ class TestReading:
     ) -> None:
         plain = one(inside).replace("<robot", '<robot xmlns="http://a" xmlns:sim="http://b"')
         for text in (before + plain, before + plain.replace(' xmlns:sim="http://b"', "")):
-            assert read_urdf(text).actuated == ("j",)
+            assert read_urdf(text).actuated_joints == ("j",)
             assert read_urdf(text.encode("utf-8-sig")).links == ("a", "b")
 
     @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
@@ -128,7 +128,7 @@ class TestReading:
         second = joint("second", "b", "c", '<mimic joint="first" multiplier="2" offset="1"/>')
         third = joint("third", "c", "d", '<mimic joint="second" multiplier="-3"/>')
         model = read_urdf(urdf(joint("first", "a", "b"), second, third, links=links))
-        assert model.actuated == ("first",)
+        assert model.actuated_joints == ("first",)
         assert model.leader("third") == Mimic("first", -6, -3)
         assert model.leader("first") == Mimic("first", 1, 0)
 

@@ -35,7 +35,7 @@ def ramp(begin: float, end: float) -> torch.Tensor:
     return ((TIME - begin) / (end - begin)).clamp(0, 1)
 
 
-def shown(hands: dict[str, Frame], **objects: Frame) -> tuple[Demonstration, Poses]:
+def show(hands: dict[str, Frame], **objects: Frame) -> tuple[Demonstration, Poses]:
     return Demonstration(TIME, Poses.joints(hands), objects), Poses(tuple(hands))
 
 
@@ -54,7 +54,7 @@ def test_the_bottle_is_held_from_the_grasp_until_it_is_let_go():
     assert abs(hold.begin - ARRIVES) < 0.1 and abs(hold.end - HELD.end) < 0.1
 
 
-def changed(change):
+def change_poses(change):
     """Demonstrations in which what moves is changed."""
     return [
         replace(d, frames={n: change(f) if f.batch_shape else f for n, f in d.frames.items()})
@@ -65,7 +65,7 @@ def changed(change):
 @pytest.mark.parametrize("noise", [0.0005, 0.002])
 def test_trackers_are_noisy(noise):
     rng = np.random.default_rng(0)
-    [hold] = find_holds(changed(lambda frame: seen(frame, rng, noise)), upper_body())
+    [hold] = find_holds(change_poses(lambda frame: seen(frame, rng, noise)), upper_body())
     assert (hold.frame, hold.link) == ("bottle", HAND)
     # to within the time it takes to move by the tolerance
     assert ARRIVES - 0.4 <= hold.begin <= LIFTS + 0.4
@@ -75,13 +75,13 @@ def test_trackers_are_noisy(noise):
 def test_what_never_moves_is_never_held():
     assert find_holds(few_bottles(), upper_body()) == ()
     assert find_holds([at_first(d) for d in carries()], upper_body()) == ()
-    still = changed(lambda frame: frame[:1].expand((121,)))
+    still = change_poses(lambda frame: frame[:1].expand((121,)))
     assert find_holds(still, upper_body()) == ()
 
 
 def test_what_somebody_else_moves_is_not_held():
     hands = {"left": along(0.1 * torch.sin(TIME)), "right": along(0.0, 1.0)}
-    demonstration, poses = shown(hands, cup=along(0.3 * ramp(1, 3), 0.2))
+    demonstration, poses = show(hands, cup=along(0.3 * ramp(1, 3), 0.2))
     assert find_holds([demonstration], poses) == ()
 
 
@@ -89,7 +89,7 @@ def test_one_after_the_other():
     x, y = 0.4 * ramp(1, 2) + 0.2 * ramp(4, 5), 0.5 * ramp(0, 0.5) * (1 - ramp(5.2, 5.8))
     left = along(0.4 * ramp(1, 2) - 0.3 * ramp(2.5, 3), 0.3 * (1 - ramp(0.1, 0.5)))
     right = along(0.8 - 0.4 * ramp(2, 3) + 0.2 * ramp(4, 5), 0.1, y)
-    demonstration, poses = shown({"left": left, "right": right}, cup=along(x, turn=0.0))
+    demonstration, poses = show({"left": left, "right": right}, cup=along(x, turn=0.0))
     first, second = find_holds([demonstration], poses)
     assert (first.link, second.link) == ("left", "right")
     assert 0.5 <= first.begin <= 1 and 2 <= first.end <= 2.6
@@ -102,7 +102,7 @@ def test_from_hand_to_hand_leaves_no_gap():
     for come, gone in ((2.5, 3.4), (2.6, 3.4), (2.7, 3.5), (2.8, 3.5), (2.9, 2.3)):
         left = along(brought - 0.2 * (1 - ramp(0, 0.5)) - 0.4 * ramp(gone, gone + 0.4), 0.1)
         right = along(0.3 + taken + 0.4 * (1 - ramp(come - 0.4, come)), -0.1)
-        several.append(shown({"left": left, "right": right}, cup=along(brought + taken)))
+        several.append(show({"left": left, "right": right}, cup=along(brought + taken)))
     poses = several[0][1]
     for one, _ in several[:4]:
         first, second = find_holds([one], poses)
@@ -120,7 +120,7 @@ def test_a_hand_may_shift_what_it_closes_around():
     hand = along(path - 0.2 * (1 - ramp(0, 1)))
     for shift, begin in ((0.025, 1.0), (-0.025, 1.0), (0.05, 2.2)):  # or it is brought
         cup = along(path, shift * ramp(2, 2.2), turn=4 * shift * ramp(2, 2.2))
-        demonstration, poses = shown({"hand": hand}, cup=cup)
+        demonstration, poses = show({"hand": hand}, cup=cup)
         [hold] = find_holds([demonstration], poses)
         assert hold.begin == pytest.approx(begin, abs=0.1) and hold.end == np.inf
 
@@ -128,7 +128,7 @@ def test_a_hand_may_shift_what_it_closes_around():
 def test_a_pause_on_the_way_is_no_release():
     x = 0.3 * ramp(1, 2) + 0.3 * ramp(4, 5)
     hand = along(x - 0.2 * (1 - ramp(0, 0.5)), turn=x)
-    demonstration, poses = shown({"hand": hand}, cup=along(x, turn=x))
+    demonstration, poses = show({"hand": hand}, cup=along(x, turn=x))
     [hold] = find_holds([demonstration], poses)
     assert 0.5 <= hold.begin <= 1 and hold.end == np.inf
 
@@ -138,12 +138,12 @@ def test_of_two_hands_one_is_the_holder_in_all_demonstrations():
     near = {"left": along(x, 0.2), "right": along(x, -0.2)}
     rng, count = np.random.default_rng(0), 6
     looks = [{n: seen(f, rng, 2e-4) for n, f in near.items()} for _ in range(count)]
-    noisy = [shown(look, cup=along(x)) for look in looks]
+    noisy = [show(look, cup=along(x)) for look in looks]
     [hold] = find_holds([one for one, _ in noisy], noisy[0][1])
     assert hold.link == "left"
     # the right one slips
     slipping = {"left": along(x, 0.2), "right": along(x, -0.2 - 0.008 * ramp(1, 3))}
-    demonstration, poses = shown(dict(reversed(slipping.items())), cup=along(x))
+    demonstration, poses = show(dict(reversed(slipping.items())), cup=along(x))
     assert find_holds([demonstration], poses)[0].link == "left"
 
 

@@ -8,7 +8,7 @@ from tests.support.local_coordinates import local_coordinates
 from tests.support.motions import turning
 from tpgmm_torch import AbsoluteOrientation, AbsolutePosition, Canonical, Demonstration, Stack
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.training.local_data import constant_columns, like, local_data
 
@@ -26,7 +26,7 @@ def expected_of(motion):
     return like([local_coordinates(operator, motion, HAND) for operator in OPERATORS])
 
 
-def flipped(demonstration):
+def flip_signs(demonstration):
     """The same motion; every quaternion is its negative."""
     joints = demonstration.joints * torch.tensor([1.0, 1, 1, -1, -1, -1, -1])
     return Demonstration(demonstration.time, joints, None, demonstration.joint_names)
@@ -47,7 +47,7 @@ def test_rows_are_times_and_coordinates_side_by_side():
 def test_quaternions_lie_on_the_side_of_the_first_demonstration(share):
     first, second = turning(TIME, TIME / 2), turning(TIME, (TIME / 2) ** 1.2)
     quick = turning(TIME[:25] / 2, np.linspace(share, 1, 25))
-    demonstrations = [first, flipped(second), second, flipped(quick), quick]
+    demonstrations = [first, flip_signs(second), second, flip_signs(quick), quick]
     reference, *others = local_data(demonstrations, OPERATORS, HAND)
     for rows in others:
         template = reference[np.linspace(0, 39, len(rows)).round()]
@@ -64,13 +64,13 @@ def test_quaternions_lie_on_the_side_that_a_model_expects(sign):
     templates = expected_of(motion)
     asked = []
 
-    def expected(j, time):
+    def template_at(j, time):
         asked.append((j, time))
         side = torch.ones(7, dtype=torch.float64)
         side[-4:] = sign
         return templates(j, time) * side[-templates(j, time).shape[1] :]
 
-    [turned] = local_data([flipped(motion)], OPERATORS, HAND, expected)
+    [turned] = local_data([flip_signs(motion)], OPERATORS, HAND, template_at)
     for block in QUATERNIONS:
         torch.testing.assert_close(turned[:, block], sign * rows[:, block], rtol=0, atol=1e-15)
     torch.testing.assert_close(turned[:, 6:9], rows[:, 6:9], rtol=0, atol=0)

@@ -10,11 +10,11 @@ import torch
 from tests.support.skills import HANDLING, HANDS, handlings, hands_model, waves
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.exceptions import PlausibilityWarning
-from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers, outlying_demonstrations
 
 
-def misplaced(demonstration, shift=0.3):
+def misplace(demonstration, shift=0.3):
     """The cup was seen in a wrong place."""
     cup = demonstration.frames["cup"]
     there = cup.position + torch.tensor([0.0, shift, 0.0], dtype=torch.float64)
@@ -23,13 +23,13 @@ def misplaced(demonstration, shift=0.3):
 
 def test_a_frame_a_hand_s_breadth_beside_its_place_is_found():
     # as one that was taken from the hand at a wrong instant, shortly before it closes
-    shown = [misplaced(d, 0.1) if i in (3, 8) else d for i, d in enumerate(handlings(10))]
+    shown = [misplace(d, 0.1) if i in (3, 8) else d for i, d in enumerate(handlings(10))]
     assert episodes(shown) == [3, 8]
 
 
 def some_misplaced(n, wrong):
     shown = handlings(n)
-    return [misplaced(d) if index in wrong else d for index, d in enumerate(shown)]
+    return [misplace(d) if index in wrong else d for index, d in enumerate(shown)]
 
 
 def episodes(shown):

@@ -1,4 +1,4 @@
-"""Demonstrations in batches: the same model as from a list of them."""
+"""Demonstrations as rows: in batches as in a list, and a few points for many."""
 
 from collections import Counter
 from dataclasses import replace
@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from tests.support.skills import (
+    HANDLING,
+    HANDS,
     bottle_model,
     canonical,
     few_bottles,
@@ -20,8 +22,10 @@ from tpgmm_datasets import EpisodeBatches, save_lerobot
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.mixture.row_file import RowFile
 from tpgmm_torch.robots.robot import Robot
-from tpgmm_torch.training.local_data import Motion
+from tpgmm_torch.training.local_data import Motion, local_data
+from tpgmm_torch.training.training_rows import equivalent_points, equivalent_rows
 
 
 class Batches:
@@ -89,7 +93,7 @@ def test_batches_are_read_once_and_may_come_from_a_generator():
 def test_names_order_the_joints_of_all_batches():
     names = waves()[0].joint_names or tuple(f"j{i}" for i in range(waves()[0].n_joints))
     named = [replace(wave, joint_names=names) for wave in waves(4)]
-    turned = [*named[:2], *(wave.reordered(names[::-1]) for wave in named[2:])]
+    turned = [*named[:2], *(wave.reorder(names[::-1]) for wave in named[2:])]
     assert_same(canonical().fit(Batches(turned)), canonical().fit(named))
 
 
@@ -116,7 +120,7 @@ def test_uneven_batches_have_no_instants():
 def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(monkeypatch):
     counts = Counter()
 
-    def counted(kind, name):
+    def count_calls(kind, name):
         method = getattr(kind, name)
 
         def counting(self, *given):
@@ -126,8 +130,8 @@ def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(
         monkeypatch.setattr(kind, name, counting)
 
     demonstrations = LinearTimeNormalization().fit_transform(few_bottles())
-    counted(Robot, "state")
-    counted(Motion, "coordinates")
+    count_calls(Robot, "state")
+    count_calls(Motion, "coordinates")
     model = bottle_model(8, tol=1e-1).fit(demonstrations)
     number = len(demonstrations)
     assert counts["coordinates"] == number * len(model.operators_)
@@ -152,3 +156,38 @@ def test_episodes_of_a_data_set_are_batches(tmp_path):
     assert_same(canonical().fit(batches), canonical().fit(again))
     with pytest.raises(ValueError, match="size=0"):
         EpisodeBatches(path, 0)
+
+
+def test_a_few_points_have_the_moments_of_many():
+    rows = local_data(handlings(6), HANDLING, HANDS)
+    many = torch.stack(rows)[:, :, :5]  # demonstrations, instants, columns
+    mean = many.mean(0)
+    scatter = torch.einsum("mti,mtj->tij", many - mean, many - mean) / len(many)
+    few = equivalent_points(mean, scatter, 8)
+    torch.testing.assert_close(few.mean(1), mean)
+    spread = few - mean[:, None]
+    torch.testing.assert_close(spread.mT @ spread / 8, scatter, rtol=1e-12, atol=1e-15)
+
+
+def test_points_without_spread_are_their_mean():
+    mean = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    found = equivalent_points(mean, torch.zeros(1, 2, 2, dtype=torch.float64), 3)
+    assert torch.equal(found, mean.expand(3, 2)[None])
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_instants_have_the_moments_of_all_demonstrations_block_by_block(in_file):
+    """However far the reference."""
+    rng, widths, length = np.random.RandomState(0), (2, 3), 20
+    many = rng.standard_normal((7, length, 5)) + 1e3
+    rows = many.reshape(-1, 5)
+    given = RowFile.of([rows]) if in_file else rows
+    points, size = equivalent_rows(given, many[0] + 0.5, widths)
+    assert size == 4
+    points = points.reshape(length, size, 5)
+    np.testing.assert_allclose(points.mean(1), many.mean(0), rtol=1e-12)
+    for block in (slice(0, 2), slice(2, 5)):
+        for t in range(length):
+            expected = np.cov(many[:, t, block].T, bias=True)
+            found = np.cov(points[t, :, block].T, bias=True)
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

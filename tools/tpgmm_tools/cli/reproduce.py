@@ -124,7 +124,7 @@ def _choose_ways(skill: Any, situations: list[Situation]) -> Iterator[object]:
     from tpgmm_torch.skills.ways import Ways
 
     for one in situations if isinstance(skill, Ways) else ():
-        situation = one.reordered(skill.kinematics.joint_names)
+        situation = one.reorder(skill.kinematics.joint_names)
         yield from skill.choose(situation.joints, at_first(situation))
 
 

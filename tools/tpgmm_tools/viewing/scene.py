@@ -174,7 +174,7 @@ class MotionScene:
             )
         self._links = kinematics.links
         self._body, self._shapes = whole_body(kinematics, self.meshes)
-        self._shown = [one.reordered(kinematics.joint_names) for one in self.demonstrations]
+        self._shown = [one.reorder(kinematics.joint_names) for one in self.demonstrations]
         links = range(len(self._links))  # the first of the body's
         self._paths = [
             as_array(self._body.state(one.joints).positions)[:, links] for one in self._shown

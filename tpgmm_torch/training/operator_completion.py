@@ -1,4 +1,8 @@
-"""Axes along which demonstrated forces do no work, which are those to control."""
+"""What operators take from demonstrations: mean orientations, and axes of forces.
+
+Rotation vectors are Gaussian about the mean orientation at each instant. A force is controlled
+along the axes along which the demonstrated forces do no work.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +13,19 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from tpgmm_torch import quaternions
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
-from tpgmm_torch.operators import Operator, Wrench
+from tpgmm_torch.operators import (
+    AbsoluteOrientation,
+    Operator,
+    RelativeOrientation,
+    Stack,
+    Wrench,
+)  # fmt: skip
+from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import Motion
 
-__all__ = ["shares_of_work", "with_force_axes"]
+__all__ = ["shares_of_work", "with_force_axes", "with_mean_orientations"]
 
 #: A force does no work along an axis below this share of the work that it could do. Forces
 #: against a surface have shares of 0.00 to 0.02, friction 0.26 to 0.88 (wiping).
@@ -27,13 +39,14 @@ ALWAYS = (
 def with_force_axes(
     operators: Sequence[Operator], motions: Sequence[Motion]
 ) -> tuple[Operator, ...]:
-    """Operators of forces with the axes along which the demonstrated forces do no work.
+    """Add axes to operators of forces: those along which they do no work.
 
     Parameters
     ----------
     operators : sequence of Operator
         Those that have axes keep them.
     motions : sequence of Motion
+        With wrenches of the operators' links.
 
     Returns
     -------
@@ -45,13 +58,13 @@ def with_force_axes(
         If no force does no work, or a link is never in contact.
     """
     return tuple(
-        _completed(one, motions) if isinstance(one, Wrench) and one.axes is None else one
+        _choose_axes(one, motions) if isinstance(one, Wrench) and one.axes is None else one
         for one in operators
     )
 
 
-def _completed(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
-    shares, sizes = (each.tolist() for each in shares_of_work(operator, motions))
+def _choose_axes(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
+    shares, sizes = (values.tolist() for values in shares_of_work(operator, motions))
     every = list(zip("xyz", shares, sizes, strict=True))
     found = [s < NO_WORK and size >= operator.contact for _, s, size in every]
     if not any(found):
@@ -65,7 +78,7 @@ def _completed(operator: Wrench, motions: Sequence[Motion]) -> Wrench:
 
 
 def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:
-    """Share of work ``|sum_t f v| / (n rms(f) rms(|v|))`` of a force along each axis.
+    """Compute ``|sum_t f v| / (n rms(f) rms(|v|))`` of a force along each axis.
 
     Parameters
     ----------
@@ -97,7 +110,7 @@ def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor,
             [speed] = torch.gradient(way, spacing=(motion.time,), dim=0)
             forces.append(local[touches, :3])
             speeds.append(speed[touches])
-    force, speed = (torch.cat(each) for each in (forces, speeds))
+    force, speed = (torch.cat(parts) for parts in (forces, speeds))
     if len(force) == sum(len(motion.time) for motion in motions):
         warnings.warn(ALWAYS.format(operator), PlausibilityWarning, stacklevel=2)
     if len(force) < 2:
@@ -109,3 +122,47 @@ def shares_of_work(operator: Wrench, motions: Sequence[Motion]) -> tuple[Tensor,
     possible = len(force) * sizes * speed.square().sum(-1).mean().sqrt()
     work = (force * speed).sum(0).abs()
     return torch.where(possible > 0, work / possible, 0.0), sizes
+
+
+def with_mean_orientations(
+    operators: Sequence[Operator], motions: Sequence[Motion], kinematics: Kinematics
+) -> tuple[Operator, ...]:
+    """Add mean orientations to operators of ``geometry="tangent"``.
+
+    At each instant it is the mean on the sphere of what the demonstrations show then.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        Those that have a path keep it.
+    motions : sequence of Motion
+        In step.
+    kinematics : Kinematics
+        On which the operators act.
+
+    Returns
+    -------
+    tuple of Operator
+    """
+    grid = max((one.time for one in motions), key=lambda time: float(time[-1]))
+    instants = grid.double()
+
+    def add_path(operator: Operator) -> Operator:
+        if isinstance(operator, Stack):
+            return Stack(*map(add_path, operator.operators))
+        if not isinstance(operator, AbsoluteOrientation | RelativeOrientation):
+            return operator
+        if operator.geometry != "tangent" or operator.path is not None:
+            return operator
+        plain = replace(operator, geometry="quaternion")
+        shown = [
+            quaternions.interpolate(
+                instants, one.time.double(), one.coordinates(plain, kinematics).double()
+            )
+            for one in motions
+        ]
+        means = quaternions.mean(torch.stack(shown, -2))
+        rows = torch.cat((instants.unsqueeze(-1), means), -1)
+        return replace(operator, path=tuple(map(tuple, rows.tolist())))
+
+    return tuple(map(add_path, operators))

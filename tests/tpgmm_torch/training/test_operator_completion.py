@@ -1,6 +1,7 @@
-"""Models whose orientations are deviations from the demonstrations' mean, on the sphere."""
+"""What operators take from demonstrations: mean orientations on the sphere, axes of forces."""
 
 import math
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from tests.support.local_coordinates import local_coordinates
+from tests.support.pressing import FRICTION, PRESS, slides, wipes
 from tests.support.skills import few_bottles
 from tests.support.worlds import OBJECT, moved, upper_body
 from tpgmm_torch import (
@@ -24,6 +26,7 @@ from tpgmm_torch import (
     save,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators import Wrench
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
@@ -32,7 +35,11 @@ from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.local_data import Motion
-from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.operator_completion import (
+    shares_of_work,
+    with_force_axes,
+    with_mean_orientations,
+)
 
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 3, 60, dtype=torch.float64)
@@ -61,18 +68,18 @@ def recordings(seed=0, count=8, spread=0.7, signs=True):
     return shown
 
 
-def completed(operators, demonstrations):
+def complete(operators, demonstrations):
     motions = [Motion.of(one, HAND, ()) for one in demonstrations]
     return with_mean_orientations(operators, motions, HAND)
 
 
-def fitted(demonstrations, *operators, **settings):
+def fit_model(demonstrations, *operators, **settings):
     return TaskParameterizedGMM(5, operators, HAND, **settings).fit(demonstrations)
 
 
 @cache
 def model(*operators):
-    return fitted(recordings(), *operators)
+    return fit_model(recordings(), *operators)
 
 
 def angles(a, b):
@@ -81,7 +88,7 @@ def angles(a, b):
     return torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
 
 
-def reproduced(skill, start, frames):
+def reproduce(skill, start, frames):
     [found] = skill.predict([Situation(start, frames)])
     return quaternions.normalize(found.joints[:, 3:])
 
@@ -96,20 +103,18 @@ def mean_of(demonstrations):
 
 def test_the_path_is_the_karcher_mean_at_each_instant():
     shown = recordings()
-    [found] = completed([ABSOLUTE], shown)
+    [found] = complete([ABSOLUTE], shown)
     local = torch.stack([local_coordinates(found, one, HAND) for one in shown])
     assert float(local.mean(0).abs().max()) < 1e-12
-    together = completed(
-        [Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown
-    )
+    together = complete([Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown)
     assert together[0].operators[1].path is not None
-    assert completed(together, shown[:2]) == together
+    assert complete(together, shown[:2]) == together
 
 
 def test_a_demonstration_that_is_over_counts_with_its_last_orientation():
     one, other = recordings(count=2)
     short = Demonstration(TIME[:30], other.joints[:30], other.frames)
-    [found] = completed([ABSOLUTE], [one, short])
+    [found] = complete([ABSOLUTE], [one, short])
     last = torch.stack((one.joints[-1, 3:], other.joints[29, 3:]))
     row = torch.tensor(found.path[-1][1:], dtype=torch.float64)
     assert float(angles(row, quaternions.mean(last))) < 1e-9
@@ -126,7 +131,7 @@ def test_turning_the_world_turns_what_is_reproduced():
         for one in shown
         for pose in [moved(Frame(one.joints[:, :3], one.joints[:, 3:]))]
     ]
-    here, there = model(ABSOLUTE, RELATIVE), fitted(turned, ABSOLUTE, RELATIVE)
+    here, there = model(ABSOLUTE, RELATIVE), fit_model(turned, ABSOLUTE, RELATIVE)
     for one, other in zip(
         (*here.means_, *here.covariances_), (*there.means_, *there.covariances_), strict=True
     ):
@@ -134,8 +139,8 @@ def test_turning_the_world_turns_what_is_reproduced():
     frame = recordings(seed=9, count=1)[0].frames[OBJECT]
     start = torch.cat((torch.zeros(3).double(), mean_of(shown)[0]))
     pose = moved(Frame(start[:3], start[3:]))
-    found = reproduced(here, start, {OBJECT: frame})
-    other = reproduced(
+    found = reproduce(here, start, {OBJECT: frame})
+    other = reproduce(
         there, torch.cat((pose.position, pose.orientation)), {OBJECT: moved(frame)}
     )
     expected = moved(Frame(torch.zeros(60, 3).double(), found)).orientation
@@ -151,7 +156,7 @@ def test_orientations_far_apart_are_reproduced_better_than_in_four_coordinates(s
     wanted = mean_of(shown)
     start = torch.cat((torch.zeros(3).double(), wanted[0]))
     plain, tangent = (
-        angles(reproduced(fitted(shown, operator), start, {}), wanted).mean()
+        angles(reproduce(fit_model(shown, operator), start, {}), wanted).mean()
         for operator in (AbsoluteOrientation("hand"), ABSOLUTE)
     )
     assert float(tangent) <= 0.5 * float(plain)
@@ -185,16 +190,16 @@ def test_a_model_is_what_it_was_after_saving_it(tmp_path):
     shown = recordings(seed=3, count=2)
     np.testing.assert_array_equal(again.score_samples(shown), skill.score_samples(shown))
     start, frames = shown[0].joints[0], dict(shown[0].frames)
-    assert torch.equal(reproduced(again, start, frames), reproduced(skill, start, frames))
+    assert torch.equal(reproduce(again, start, frames), reproduce(skill, start, frames))
 
 
 def test_batches_lie_about_the_mean_of_the_first():
     shown = recordings()
-    streamed = fitted([shown[:5], shown[5:]], ABSOLUTE)
-    assert streamed.operators_ == completed([ABSOLUTE], shown[:5])
+    streamed = fit_model([shown[:5], shown[5:]], ABSOLUTE)
+    assert streamed.operators_ == complete([ABSOLUTE], shown[:5])
     wanted = mean_of(shown)
     start = torch.cat((torch.zeros(3).double(), wanted[0]))
-    assert float(angles(reproduced(streamed, start, {}), wanted).mean()) < 0.1
+    assert float(angles(reproduce(streamed, start, {}), wanted).mean()) < 0.1
 
 
 def test_orientations_that_never_vary_are_as_certain_as_in_four_coordinates():
@@ -206,13 +211,13 @@ def test_orientations_that_never_vary_are_as_certain_as_in_four_coordinates():
         for k in (0.9, 1.0, 1.1)
     ]
     for operator in (AbsoluteOrientation("hand"), ABSOLUTE):
-        skill = fitted(shown, operator)
+        skill = fit_model(shown, operator)
         assert float(torch.linalg.eigvalsh(skill.covariances_[0]).min()) > 1e-9
 
 
 def test_the_time_of_a_product_is_refused():
     with pytest.raises(DataError, match="activation='time'"):
-        fitted(recordings(), ABSOLUTE, fusion=CovarianceFusion(activation="product"))
+        fit_model(recordings(), ABSOLUTE, fusion=CovarianceFusion(activation="product"))
 
 
 @cache
@@ -265,3 +270,35 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
     heights, downhill, _ = cost(torch.cat((joints[None, None], joints + steps, joints - steps)))
     slope = (heights[1:18] - heights[18:]).squeeze() / 2e-6
     assert float((slope + downhill[0].squeeze()).abs().max() / downhill[0].abs().max()) < 1e-6
+
+
+PALM = Wrench("hand", "board")
+
+
+def motions(demonstrations):
+    return [Motion.of(one, slides()) for one in demonstrations]
+
+
+def test_friction_works_and_a_press_does_not():
+    shares, sizes = shares_of_work(PALM, motions(wipes()))
+    np.testing.assert_allclose(sizes, [FRICTION * PRESS, 0, PRESS], atol=1e-9)
+    assert shares[0] > 0.95
+    assert shares[2] < 0.05
+    assert with_force_axes([PALM], motions(wipes())) == (Wrench("hand", "board", [2]),)
+
+
+def test_given_axes_are_kept():
+    given = Wrench("hand", "board", [0])
+    assert with_force_axes([given], motions(wipes())) == (given,)
+
+
+def test_pushing_a_damper_is_work():
+    shown = wipes()[0]
+    time = np.asarray(shown.time)
+    way = 0.05 * np.sin(np.pi * time / time[-1])
+    joints = torch.from_numpy(np.stack((0 * way, 0 * way, 0.3 - way), -1))
+    wrench = torch.zeros(len(time), 6).double()
+    wrench[:, 2] = torch.from_numpy(-200 * np.gradient(way, time))
+    pushed = replace(shown, joints=joints, wrenches={"hand": wrench})
+    with pytest.raises(DataError, match=r"no force of 'hand' .* z 1\.00 at"):
+        with_force_axes([PALM], motions([pushed]))
