@@ -10,8 +10,8 @@ Karcher mean, the rotation to which their squared angles add up to the least.
 
 The recordings are those of ``leave_one_out.py``, and so are the folds. Both models have the
 same settings and data and differ in the ``geometry`` of their orientation operators alone. The
-log-likelihood per time step counts orientations per volume of rotations (``rotation_log_density``),
-of time and of all operators' coordinates.
+log-likelihood per time step counts orientations per volume of rotations, of time and of all
+operators' coordinates.
 """
 
 import argparse
@@ -105,7 +105,7 @@ def wide(seeds: int = 20) -> dict[float, np.ndarray]:
 def rotation_log_density(
     regression: Regression, time: Tensor, local: Sequence[Tensor], n_samples: int = 400
 ) -> Tensor:
-    """Compute the log-density (T,) of time and local coordinates, orientations per volume of rotations.
+    """Compute the log-density (T,) of time and local coordinates, per volume of rotations.
 
     Quaternions have a density over four coordinates, rotation vectors one over three: they are
     compared as densities of rotations, whose volume is that of small rotation vectors [rad^3],
@@ -115,7 +115,7 @@ def rotation_log_density(
         p(x, eps | t) = sum_i h_i p_i(x, eps | t) / sum_i h_i Z_i,
         Z_i = int p_i(eps | t) d eps   over one hemisphere about the mean,
 
-    by importance sampling with ``n_samples`` draws in the tangent space of the mean's direction.
+    by importance sampling in the tangent space of the mean's direction.
     """
     total = regression.log_density(time, local)
     constant, four = time.new_zeros(()), False

@@ -53,8 +53,8 @@ skill = ViaPoints(model.skill, [ViaPoint(2.0, "canonical", [0.5])])
 # ------------
 # Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in
 # the skill that belongs is found, and the model is learned again, without the two oldest
-# demonstrations. It begins where the reproduction is most like its beginning and ends where it is
-# most like its end; of places that explain both, those count at which it is about as fast.
+# demonstrations. It begins where the reproduction is like its beginning, and ends where that
+# is like its end; of places that explain both, those count at which it is about as fast.
 
 
 def in_skill_time(reproduction, shown, max_slope=4.0):

@@ -37,7 +37,7 @@ from tpgmm_torch.regression.conditionals import (
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
-from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.posture import PostureSearch, Residual
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
@@ -182,10 +182,10 @@ class Regression:
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
-            found = self._unbounded(time, state, frames)
+            found = self._estimate_together(time, state, frames)
         else:
             found = self._in_parts(batch, time, state, poses)
-        found = self.bounded(found, bounds)
+        found = keep_within(found, bounds)
         if candidates:
             own = self.candidates(time, self._state(state), frames, found)
             found = replace(found, candidates=own)
@@ -472,6 +472,11 @@ class Regression:
         """See :attr:`Skill.gates`."""
         return ()
 
+    @property
+    def summaries(self) -> tuple[TrainingSummary, ...]:
+        """See :attr:`Skill.summaries`."""
+        return () if self.summary is None else (self.summary,)
+
     @cached_property
     def _likelihoods(self) -> dict[bytes, TimeLikelihood]:
         return {}
@@ -559,7 +564,7 @@ class Regression:
     def _state(self, state: Tensor | RobotState) -> RobotState:
         return state if isinstance(state, RobotState) else self.kinematics.state(state)
 
-    def _unbounded(
+    def _estimate_together(
         self, time: Tensor, state: Tensor | RobotState, frames: Mapping[str, Frame]
     ) -> Estimate:
         components = self._components_at(time)
@@ -584,7 +589,9 @@ class Regression:
         parts = []
         for part in order.split(PART):
             here = {name: pose[part] for name, pose in poses.items()}
-            parts.append(self._unbounded(time[part] if time.ndim else time, state[part], here))
+            parts.append(
+                self._estimate_together(time[part] if time.ndim else time, state[part], here)
+            )
         back = order.argsort()
 
         def whole(name: str) -> Tensor:
@@ -596,14 +603,6 @@ class Regression:
             whole("covariance"),
             whole("activation") if activation.ndim > 1 else activation,
         )
-
-    @staticmethod
-    def bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
-        """An ``estimate``, given that joints keep within ``bounds`` if there are some."""
-        if bounds is None:
-            return estimate
-        joints = within(estimate.joints, estimate.covariance, *bounds)
-        return estimate if joints is estimate.joints else replace(estimate, joints=joints)
 
     def _local(
         self,

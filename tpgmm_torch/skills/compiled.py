@@ -29,6 +29,7 @@ from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.regression import Components, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
@@ -183,7 +184,7 @@ class CompiledRegression(Regression):
         if not math.isfinite(mean.sum().item()):  # the plain estimate says what is wrong
             return super().estimate(time, state, frames, bounds)
         estimate = Estimate(mean, covariance, results[0][2] @ components.places)
-        return self.bounded(estimate, bounds)
+        return keep_within(estimate, bounds)
 
     def _serves(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> bool:
         """Whether the graph gives this estimate: few components, no gradients, all frames."""

@@ -25,6 +25,7 @@ from tpgmm_torch.regression.regression import PART
 from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.skills.situations import completed_situations, with_novelty
 from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = ["Tick", "open_loop", "reproduce", "sample"]
 
@@ -63,8 +64,8 @@ def reproduce(
         together = _run_together(skill, batch, candidates, ticks or open_loop)
         trajectories.update(zip(members, together, strict=True))
     done = [trajectories[index] for index in range(len(known))]
-    if hasattr(skill, "missed"):
-        skill.missed(known, done).act()
+    if isinstance(skill, ViaPoints):
+        skill.report_misses(known, done).act()
     return with_novelty(skill, known, done)
 
 
@@ -168,7 +169,7 @@ def _run_together(
     whole = _over_time(estimates, shape)
     joints = torch.stack(references).view(shape)
     own: list[Candidate] = []
-    if candidates and hasattr(skill, "candidates"):
+    if candidates:
         states = torch.cat((start[None], joints[:-1]))
         own = _candidates(skill, held, states, frames, holdings, whole)
     names = skill.kinematics.joint_names
@@ -204,7 +205,7 @@ def _row(candidates: Sequence[Candidate], row: int) -> tuple[Candidate, ...]:
 
 
 def _candidates(
-    skill: Any,
+    skill: Skill,
     time: torch.Tensor,
     joints: torch.Tensor,
     frames: Mapping[str, Frame],

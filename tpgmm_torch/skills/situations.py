@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import check_situations
-from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
@@ -47,7 +46,7 @@ def completed_frames(
         If a frame that the skill needs is missing, or has the name of a link.
     """
     complete, start = dict(frames), skill.kinematics.joint_tensor(joints)
-    for summary in _summaries(skill):
+    for summary in skill.summaries:
         complete |= summary.start_frames(start, skill.kinematics, complete)
     for name in skill.frame_names:
         if name not in complete:
@@ -86,7 +85,7 @@ def completed_situations(
             torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
             skill.kinematics,
             _span(skill),
-            _summaries(skill),
+            skill.summaries,
         )
         report.act()
     return situations
@@ -133,7 +132,7 @@ def report_start(
     span = _span(skill)
     known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
     now = span[0] if time is None else time
-    check_situations(start, known, now, skill.kinematics, span, _summaries(skill)).act()
+    check_situations(start, known, now, skill.kinematics, span, skill.summaries).act()
 
 
 def tick_inputs(
@@ -162,12 +161,6 @@ def tick_inputs(
     return as_tensor(time, "time").to(kinematics.lower), state, here
 
 
-def _summaries(skill: Skill) -> list[TrainingSummary]:
-    """Summary of the demonstrations of a skill, or of each of its ways until one is chosen."""
-    ways = getattr(skill, "skills", ()) if skill.summary is None else ()
-    return [one.summary for one in (skill, *ways) if one.summary is not None]
-
-
 def _span(skill: Skill) -> Tensor:
     """Begin and end of a skill [s]."""
     return torch.tensor([skill.begin, skill.end], dtype=torch.float64)
@@ -183,7 +176,7 @@ def with_novelty(
     skill : Skill
     situations, trajectories : sequence of Situation, sequence of Trajectory
     """
-    summaries = _summaries(skill)
+    summaries = skill.summaries
     if not summaries:
         return list(trajectories)
     found = []

@@ -14,9 +14,7 @@ from torch import Tensor
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -111,39 +109,13 @@ class Ways(CompositeSkill):
             object.__setattr__(self, name, value)
 
     @property
-    def end(self) -> float:
-        """See :attr:`Skill.end`; ways that last longer or shorter are played in that time."""
-        return self.skills[0].end
-
-    @property
-    def time(self) -> Tensor:
-        """See :attr:`Skill.time`."""
-        time = self.skills[0].time
-        assert time is not None
-        return time
-
-    @property
-    def holds(self) -> tuple[Hold, ...]:
-        """See :attr:`Skill.holds`: those of the way of all robots, or of the first."""
-        return self._first.holds
-
-    @property
-    def motion_bounds(self) -> MotionBounds | None:
-        """See :attr:`Skill.motion_bounds`."""
-        return self._first.motion_bounds
-
-    @property
-    def peaks(self) -> tuple[Tensor, Tensor] | None:
-        """Accelerations and jerks of the demonstrations."""
-        return self._first.peaks
-
-    @property
     def summary(self) -> TrainingSummary | None:
-        """See :attr:`Skill.summary`."""
-        return None if self.chosen is None else self._first.summary
+        """See :attr:`Skill.summary`; None until the way is chosen."""
+        return None if self.chosen is None else self.representative.summary
 
     @property
-    def _first(self) -> Regression:
+    def representative(self) -> Regression:
+        """The way of all robots, or of the first."""
         return self.skills[0 if self.chosen is None else int(self.chosen.flatten()[0])]
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
