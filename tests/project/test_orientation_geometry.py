@@ -58,7 +58,7 @@ def test_the_density_is_normalised_over_rotations(geometry, spread, rotation_log
     [operator] = regression.operators
     local = operator.at(now).coordinates(state, {})
     if geometry == "quaternion":
-        local = quaternions.match_hemisphere(local, regression.expected(0, now[None]))
+        local = quaternions.match_hemisphere(local, regression.expect(0, now[None]))
     time = now.expand(count)
     marginal = regression.marginals.log_activation(now[None]).logsumexp(-1)
     log_time = marginal - 0.5 * math.log(2 * math.pi)

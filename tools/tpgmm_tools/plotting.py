@@ -296,7 +296,7 @@ def plot_local(
         shown.append((motion, {**look, **style}))
 
     def expected(_operator: int, time: Tensor) -> Tensor:
-        return model.skill.expected(operator, time)
+        return model.skill.expect(operator, time)
 
     motions = [motion for motion, _ in shown]
     rows = local_data(motions, [chosen], model.kinematics_, expected, model.holds_)

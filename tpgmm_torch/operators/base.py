@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "of_joints"]
+__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "leaves", "of_joints"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,22 +80,22 @@ class Operator(ABC):
 
     @abstractmethod
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """D, the number of local coordinates."""
+        """Count the local coordinates, D."""
 
     @abstractmethod
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """``J``, ``M``, ``c`` at the state q_{t-1}; frames of shapes that broadcast with it."""
+        """Compute ``J``, ``M``, ``c`` at the state q_{t-1}; frames broadcast with it."""
 
     @abstractmethod
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """The local coordinates X_t of a state, shape (..., D)."""
+        """Compute the local coordinates X_t of a state, shape (..., D)."""
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
-        """Where unit quaternions begin among the local coordinates; none by default."""
+        """List where unit quaternions begin among the local coordinates; none by default."""
         return ()
 
     def rotation_vector_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
-        """Where rotation vectors [rad] begin among the coordinates; none by default."""
+        """List where rotation vectors [rad] begin among the coordinates; none by default."""
         return ()
 
     def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
@@ -130,6 +130,20 @@ class Operator(ABC):
     def references(self) -> tuple[str, ...]:
         """Places that the coordinates refer to, as frames or links; none by default."""
         return ()
+
+    @property
+    def leaves(self) -> tuple[Operator, ...]:
+        """The operator itself; of a stack, its members."""
+        return (self,)
+
+    def text(self) -> str | None:
+        """Write it as a term of :mod:`tpgmm_torch.operators.text`; by default there is none."""
+        return None
+
+    @property
+    def is_posture(self) -> bool:
+        """Whether its coordinates are joints themselves; not by default."""
+        return False
 
     @property
     def constrains_joints(self) -> bool:
@@ -210,12 +224,17 @@ class Operator(ABC):
 
 
 def of_joints(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """Those ``operators`` that have rows in joint space: the first ones."""
+    """Select the ``operators`` that have rows in joint space: the first ones."""
     return tuple(operator for operator in operators if operator.constrains_joints)
 
 
+def leaves(operators: Iterable[Operator]) -> tuple[Operator, ...]:
+    """List the members of stacks, and other operators, of some ``operators`` in their order."""
+    return tuple(leaf for operator in operators for leaf in operator.leaves)
+
+
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
-    """Names of the frames that a situation must have, each once.
+    """List the frames that a situation must have, each once.
 
     Parameters
     ----------
@@ -229,7 +248,7 @@ def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[
 
 
 def carried_objects(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
-    """Names of the objects that operators refer to as things that the robot may carry.
+    """List the objects that operators refer to as things that the robot may carry.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class Canonical(Operator):
         object.__setattr__(self, "joints", listed)
 
     def columns(self, joint_names: Sequence[str]) -> tuple[int, ...]:
-        """Where its joints stand in the joint vector.
+        """List the indices of its joints in the joint vector.
 
         Parameters
         ----------
@@ -142,6 +142,10 @@ class Canonical(Operator):
                 starts.append(columns.index(start))
         return tuple(starts)
 
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        return "canonical" if self.joints is None else f"canonical:{','.join(self.joints)}"
+
     def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that its joints exist, and that no quaternion is cut.
 
@@ -151,6 +155,11 @@ class Canonical(Operator):
             If they do not, or one is.
         """
         self.quaternion_starts(kinematics)
+
+    @property
+    def is_posture(self) -> bool:
+        """Yes."""
+        return True
 
     @property
     def determines_joints(self) -> bool:

@@ -59,6 +59,13 @@ class PoseOperator(Operator):
         """The frame, if it is a place."""
         return (self._frame,) if self._frame and not self.held else ()
 
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        kind = "position" if self.gain is None else "orientation"
+        tangent = "[tangent]" if self.rotation_vector_starts(None) else ""
+        frame = f"@{'held:' * self.held}{self._frame}" if self._frame else ""
+        return f"{kind}{tangent}:{self.link}{frame}"
+
     @cached_property
     def term(self) -> _Term:
         """Arguments of its linearisation, for :func:`linearize_poses`."""
@@ -236,12 +243,12 @@ def _all_poses(
     positions = state.positions, *(place.position.unsqueeze(-2) for place in places)
     orientations = state.orientations, *(place.orientation.unsqueeze(-2) for place in places)
 
-    def joined(parts: Sequence[Tensor]) -> Tensor:
+    def join(parts: Sequence[Tensor]) -> Tensor:
         shapes = [(*batch, *part.shape[-2:]) for part in parts]
         both = zip(parts, shapes, strict=True)
         return torch.cat([p if p.shape == shape else p.expand(shape) for p, shape in both], -2)
 
-    return joined(positions), joined(orientations)
+    return join(positions), join(orientations)
 
 
 def _product(row: Tensor, matrix: Tensor) -> Tensor:

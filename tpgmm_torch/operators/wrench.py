@@ -147,6 +147,11 @@ class Wrench(Operator):
         """The frame."""
         return (self.frame,)
 
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        axes = f"[{''.join(map('xyz'.__getitem__, self.axes))}]" if self.axes else ""
+        return f"wrench{axes}:{self.link}@{self.frame}"
+
     def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that link and frame exist, see :meth:`Operator.check`."""
         if self.link not in kinematics.links:
@@ -180,8 +185,8 @@ class ExpectedForce:
     covariance: Tensor
     share: Tensor
 
-    def scaled(self, weight: Tensor) -> ExpectedForce:
-        """The part of it that is expected with a weight (...)."""
+    def scale(self, weight: Tensor) -> ExpectedForce:
+        """Return the part of it that is expected with a weight (...)."""
         row = weight.unsqueeze(-1)
         force, covariance = row * self.force, row.unsqueeze(-1) * self.covariance
         return ExpectedForce(self.operator, force, covariance, weight * self.share)

@@ -114,11 +114,11 @@ class Conditionals(_OfComponents):
         return cls(means[:, 1:], gain[..., 0], covariance, means[:, 0], covariances[:, 0, 0])
 
     @classmethod
-    def stacked(cls, parts: Sequence[Conditionals]) -> Conditionals:
+    def stack(cls, parts: Sequence[Conditionals]) -> Conditionals:
         """The coordinates of all parts side by side, which are independent given time."""
         time = parts[0].time_mean, parts[0].time_variance
         covariance = gaussians.block_diagonal([p.covariance for p in parts], time[0].shape)
-        mean = torch.cat([part.recentred(time[0]) for part in parts], -1)
+        mean = torch.cat([part.recenter(time[0]) for part in parts], -1)
         return cls(mean, torch.cat([part.gain for part in parts], -1), covariance, *time)
 
     @classmethod
@@ -135,7 +135,7 @@ class Conditionals(_OfComponents):
         like, time = parts[0].mean, (parts[0].time_mean, parts[0].time_variance)
         # in float64, as narrow directions lose digits soonest
         covariances = torch.stack([part.covariance.double() for part in parts])
-        means = torch.stack([part.recentred(time[0]).double() for part in parts])
+        means = torch.stack([part.recenter(time[0]).double() for part in parts])
         gains = torch.stack([part.gain.double() for part in parts])
         gain, _ = gaussians.product(gains, covariances)
         mean, covariance = gaussians.product(means, covariances)
@@ -158,7 +158,7 @@ class Conditionals(_OfComponents):
             covariance=covariance,
         )
 
-    def recentred(self, time_mean: Tensor) -> Tensor:
+    def recenter(self, time_mean: Tensor) -> Tensor:
         """Conditional means at a time of each component's own: shapes (K,) and (K, D)."""
         return self.mean + self.gain * (time_mean - self.time_mean).unsqueeze(-1)
 

@@ -30,10 +30,10 @@ from torch import Tensor
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import leaves
+from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.regression.fusion import TASKS
 from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -132,9 +132,9 @@ class PostureSearch:
         """
         rows = asked if self.active is None else asked | self.active
         if not bool(rows.any()):
-            return estimate.joints, self.begun()
+            return estimate.joints, self.reset()
         with torch.inference_mode():
-            trust, goal, *state = self._searched(
+            trust, goal, *state = self._search_rows(
                 time, reference, frames, estimate, bounds, rows, state_at
             )
         goal, trust = goal.clone(), trust.clone()
@@ -145,18 +145,18 @@ class PostureSearch:
         searched = replace(self, active=active, postures=postures, damping=damping, age=age)
         return wanted, searched
 
-    def begun(self) -> Self:
+    def reset(self) -> Self:
         """The same before any robot is searched for."""
         return replace(self, active=None, postures=None, damping=None, age=None)
 
-    def ended(self, robots: Tensor) -> Self:
+    def drop_robots(self, robots: Tensor) -> Self:
         """The same without the searches of robots (...) that were displaced."""
         active = None if self.active is None else self.active & ~robots
         if active is None or not bool(active.any()):
-            return self.begun()
+            return self.reset()
         return replace(self, active=active)
 
-    def _searched(
+    def _search_rows(
         self,
         time: Tensor,
         reference: Tensor,
@@ -393,7 +393,7 @@ class Residual:
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
         parts: Sequence[Any] = leaves([operator])
-        parts = parts if all(type(leaf) in TASKS for leaf in parts) else ()
+        parts = parts if all(type(leaf) in POSE_OPERATORS for leaf in parts) else ()
         column = 0
         with torch.inference_mode(False):  # as it serves where gradients are wanted, too
             like = kinematics.lower.new_ones(len(parts))

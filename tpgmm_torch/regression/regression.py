@@ -24,9 +24,8 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
-from tpgmm_torch.operators.base import carried_objects, frame_names, of_joints
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators import Linearization, Operator, Stack
+from tpgmm_torch.operators.base import carried_objects, frame_names, leaves, of_joints
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import (
     ActiveComponents,
@@ -103,7 +102,7 @@ class Regression:
         The form of the product (2), and its settings.
     n_samples : float, optional
         Of each component, if joints shall give way by what few of them leave unknown, see
-        :attr:`fused`.
+        :attr:`scaled_conditionals`.
     begin, end : float
         Start and end of the skill [s].
     holds : tuple of Hold
@@ -222,7 +221,7 @@ class Regression:
         step, covariance = gaussians.moment_match(weights, steps, covariances)
         return state.joints + step, covariance, weights
 
-    def expected(self, operator: int, time: Tensor) -> Tensor:
+    def expect(self, operator: int, time: Tensor) -> Tensor:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
         means = self.conditionals[operator].at(time)
         return (self.weights_at(time).unsqueeze(-2) @ means).squeeze(-2)
@@ -263,13 +262,13 @@ class Regression:
         with torch.inference_mode():
             return torch.from_numpy(self._likelihoods[key](state, frames, window))
 
-    def observed(self, names: frozenset[str]) -> Regression | None:
-        """The mixture of observed operators; see :meth:`Skill.observed`.
+    def restrict_to(self, names: frozenset[str]) -> Regression | None:
+        """The mixture of observed operators; see :meth:`Skill.restrict_to`.
 
         Of a stack of operators, those of which all frames and links are observed are kept.
         """
-        if names in self._observed:
-            return self._observed[names]
+        if names in self._restrictions:
+            return self._restrictions[names]
         pairs = zip(self.operators, self.conditionals, strict=True)
         every = enumerate(self._part(operator, one, names) for operator, one in pairs)
         kept = {index: part for index, part in every if part is not None}
@@ -283,7 +282,7 @@ class Regression:
             if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
                 fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
             found = replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
-        self._observed[names] = found
+        self._restrictions[names] = found
         return found
 
     def _part(
@@ -321,7 +320,9 @@ class Regression:
     def _search(self) -> PostureSearch:
         own = of_joints(self.operators)
         terms = [Residual.of(operator, self.kinematics) for operator in own]
-        return PostureSearch(self.kinematics, terms, self.fused, self.free_precision)
+        return PostureSearch(
+            self.kinematics, terms, self.scaled_conditionals, self.free_precision
+        )
 
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
@@ -365,7 +366,7 @@ class Regression:
         for j, operator in enumerate(of_joints(self.operators)):
             rows = operator.at(time).coordinates(state, frames)
             rows = rows.expand(*batch, -1).reshape(len(times), -1)
-            wanted = self.expected(j, times)
+            wanted = self.expect(j, times)
             starts = operator.quaternion_starts(self.kinematics)
             local.append(quaternions.hemisphere_signs(rows, wanted, starts) * rows)
             expected.append(wanted)
@@ -400,7 +401,7 @@ class Regression:
         return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
-    def fused(self) -> tuple[Conditionals, ...]:
+    def scaled_conditionals(self) -> tuple[Conditionals, ...]:
         """The conditionals as they are fused: with covariances that say who gives way.
 
         Those of what has priority are scaled down. As that scale goes to zero, the product (2)
@@ -415,7 +416,7 @@ class Regression:
         operators = of_joints(self.operators)
         priorities = self.fusion.priorities or [0] * len(operators)
         levels = sorted(set(priorities))
-        alone = all(isinstance(leaf, Canonical) for leaf in leaves(operators))
+        alone = all(leaf.is_posture for leaf in leaves(operators))
         wider = 1.0 if alone else math.sqrt(predictive_scale(self.n_samples))
         fused = []
         # what is made while inference mode is on could not serve where gradients are wanted
@@ -424,7 +425,7 @@ class Regression:
             parts = zip(local, operators, priorities, strict=True)
             for one, operator, priority in parts:
                 members = leaves([operator])
-                widths = [wider if isinstance(leaf, Canonical) else 1.0 for leaf in members]
+                widths = [wider if leaf.is_posture else 1.0 for leaf in members]
                 sizes = [leaf.dimension(self.kinematics) for leaf in members]
                 scale = one.covariance.new_tensor(np.repeat(widths, sizes))
                 own = STRICT ** levels.index(priority)
@@ -441,7 +442,7 @@ class Regression:
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return KalmanUpdate(self.kinematics, operators, self.fused)
+            return KalmanUpdate(self.kinematics, operators, self.scaled_conditionals)
 
     @cached_property
     def free_precision(self) -> Tensor:
@@ -482,7 +483,7 @@ class Regression:
         return {}
 
     @cached_property
-    def _observed(self) -> dict[frozenset[str], Regression | None]:
+    def _restrictions(self) -> dict[frozenset[str], Regression | None]:
         return {}
 
     @cached_property
@@ -495,7 +496,7 @@ class Regression:
     @cached_property
     def components(self) -> Components:
         """All components of the mixture."""
-        conditionals = self.fused
+        conditionals = self.scaled_conditionals
         if self._update is not None:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)
@@ -512,7 +513,7 @@ class Regression:
         return ActiveComponents(self.marginals, fusion.negligible)
 
     @cached_property
-    def _selected(self) -> dict[tuple[int, ...], Components]:
+    def _selections(self) -> dict[tuple[int, ...], Components]:
         return {}
 
     def _components_at(self, time: Tensor) -> Components:
@@ -524,10 +525,10 @@ class Regression:
         else:
             counts = self._active.counts(time).flatten(0, -2).any(0)
             active = tuple(counts.nonzero()[:, 0].tolist())
-        if active not in self._selected:
+        if active not in self._selections:
             with torch.inference_mode(False):
-                self._selected[active] = self._select(active)
-        return self._selected[active]
+                self._selections[active] = self._select(active)
+        return self._selections[active]
 
     def _select(self, active: tuple[int, ...]) -> Components:
         return self.components.select(active)

@@ -68,7 +68,7 @@ def compile_skill(
     """
     if backend == "inductor":
         _check_compiler("compile_skill")
-    compiled = _compiled(skill, "compile_skill", backend)
+    compiled = _wrap(skill, "compile_skill", backend)
     like = skill.kinematics.lower
     batch = () if n_robots == 1 else (n_robots,)
     here = Frame(like.new_zeros(*batch, 3))
@@ -109,7 +109,7 @@ def export_estimate(skill: Regression, path: str | Path) -> None:
             f"export_estimate() takes a skill in float64 on the CPU, got {like.dtype} on "
             f"{like.device}: fit the model with dtype='float64', device='cpu'"
         )
-    names = _compiled(skill, "export_estimate").frame_names
+    names = _wrap(skill, "export_estimate").frame_names
     contents = {
         "n_joints": len(like),
         "n_frames": len(names),
@@ -120,7 +120,7 @@ def export_estimate(skill: Regression, path: str | Path) -> None:
     }
     with _tracing(), replacing(path) as file:
         examples = like.new_zeros(()), torch.zeros_like(like), like.new_ones(len(names), 7)
-        program = _traced(_OneRobot(skill), examples)
+        program = _trace(_OneRobot(skill), examples)
         package = file.with_name("estimate.pt2")  # PyTorch wants this ending
         torch._inductor.aoti_compile_and_package(
             program,
@@ -213,7 +213,7 @@ class CompiledRegression(Regression):
         """The graph for inputs of such shapes."""
         with _tracing():
             examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
-            program = _traced(_Fusion(self), examples)
+            program = _trace(_Fusion(self), examples)
             if self.backend != "inductor":
                 graph = torch.compile(program.module(), backend=self.backend, fullgraph=True)
                 return lambda inputs: graph(*inputs)
@@ -275,7 +275,7 @@ class _OneRobot(torch.nn.Module):
         return mean[0], covariance[0]
 
 
-def _traced(
+def _trace(
     module: torch.nn.Module, examples: tuple[Tensor, ...]
 ) -> torch.export.ExportedProgram:
     module(*examples)  # caches must hold tensors, not what a trace puts in their place
@@ -291,7 +291,7 @@ def _tracing() -> Iterator[None]:
         yield
 
 
-def _compiled(skill: Regression, purpose: str, backend: str = "inductor") -> CompiledRegression:
+def _wrap(skill: Regression, purpose: str, backend: str = "inductor") -> CompiledRegression:
     """The skill with graphs, if it is of a kind that these serve."""
     settings = {field.name: getattr(skill, field.name) for field in fields(Regression)}
     compiled = CompiledRegression(**settings, backend=backend)

@@ -219,8 +219,10 @@ class Holding:
             before = self.held.get(name, FREE).later(pose, joints, shares.get(name))
             carrier = self._carrier(name, torch.as_tensor(time), before, given, where)
             place = self.frames.get(name, places[name])
-            after, places[name] = self._changed(name, before, carrier, place, pose, state_now)
-            after = self._seen(before, after, pose, state_now, dt)
+            after, places[name] = self._change_carrier(
+                name, before, carrier, place, pose, state_now
+            )
+            after = self._on_reading(before, after, pose, state_now, dt)
             if after is not FREE:
                 held[name] = after
         return replace(self, frames=places, held=self.held if held == self.held else held)
@@ -235,7 +237,7 @@ class Holding:
         none = torch.zeros_like(like, dtype=torch.bool)
         return torch.stack([none, *(~self.free(n, like) for n in self.held)]).any(0)
 
-    def taken(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
+    def take(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
         """A link holds an object, as if that had been given.
 
         Parameters
@@ -258,12 +260,12 @@ class Holding:
             taken=choose(where, place, place if before.taken is None else before.taken),
             given=where | before.given,
             apart=None if apart is None else choose(where, _constant(apart, math.inf), apart),
-            joints=_restarted(before.joints, where),
+            joints=_restart_lag(before.joints, where),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
 
-    def ungiven(self, name: str, where: Tensor) -> Self:
+    def clear_override(self, name: str, where: Tensor) -> Self:
         """The skill's holds of an object count again, whatever was given before.
 
         Parameters
@@ -278,7 +280,7 @@ class Holding:
         now = replace(before, given=before.given & ~where)
         return replace(self, held={**self.held, name: now})
 
-    def released(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
+    def release(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
         """Some robots hold nothing, and objects are where they are seen.
 
         From the next tick on the skill says what they hold.
@@ -296,7 +298,7 @@ class Holding:
             held[name] = replace(before, carrier=carrier, given=before.given & ~robots)
         return replace(self, frames=frames, held=held)
 
-    def restarted(self, robots: Tensor, joints: Tensor) -> Self:
+    def restart(self, robots: Tensor, joints: Tensor) -> Self:
         """Objects that some robots hold are, as places, where they are now.
 
         Parameters
@@ -310,10 +312,10 @@ class Holding:
         for name, held in self.held.items():
             where = robots & held.is_held
             if bool(where.any()):
-                frames[name] = choose(where, self.carried(name, state), frames[name])
+                frames[name] = choose(where, self.locate(name, state), frames[name])
         return replace(self, frames=frames)
 
-    def carried(self, name: str, state: RobotState) -> Frame:
+    def locate(self, name: str, state: RobotState) -> Frame:
         """Pose of an object that is or was held, if its link has it still."""
         return self._with(state, name, self.held[name]).pose(name)
 
@@ -355,7 +357,7 @@ class Holding:
             return torch.tensor(index), torch.tensor(True)
         return torch.where(where, index, carrier), before.given | where
 
-    def _changed(
+    def _change_carrier(
         self,
         name: str,
         before: Held,
@@ -390,11 +392,11 @@ class Holding:
             taken=now if before.taken is None else choose(held | ~holds, before.taken, now),
             given=given,
             apart=apart,
-            joints=_restarted(before.joints, holds & ~held),
+            joints=_restart_lag(before.joints, holds & ~held),
         )
         return after, choose(held & holds, place, now)
 
-    def _seen(
+    def _on_reading(
         self,
         before: Held,
         held: Held,
@@ -409,9 +411,9 @@ class Holding:
         live = held.is_held & (held.carrier == before.carrier) & ~unseen
         if bool((held.rests & unseen).any()):  # it may be lifted by now
             held = replace(held, rests=held.rests & ~unseen)
-        return self._observed(held, seen, live, state_now(), dt) if bool(live.any()) else held
+        return self._observe(held, seen, live, state_now(), dt) if bool(live.any()) else held
 
-    def _observed(
+    def _observe(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
     ) -> Held:
         """A held object after it was seen by some robots."""
@@ -435,9 +437,9 @@ class Holding:
         held = replace(held, grasp=grasp, link=link_pose)
         if bool((moving | ~held.is_held).all()):
             return held
-        return self._shifted(held, seen, live & ~moving, state, then)
+        return self._estimate_grasp(held, seen, live & ~moving, state, then)
 
-    def _shifted(
+    def _estimate_grasp(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, then: RobotState
     ) -> Held:
         """A held object that may be shifted in its link, after it was seen by some robots.
@@ -491,7 +493,7 @@ class Holding:
         return state.with_link(name, None, held.last, rests) if bool(rests.any()) else state
 
 
-def _restarted(late: Tensor | None, where: Tensor) -> Tensor | None:
+def _restart_lag(late: Tensor | None, where: Tensor) -> Tensor | None:
     """Late joints that begin with the next reading: an object that rested is not late."""
     return late if late is None else late.masked_fill(where.unsqueeze(-1), math.nan)
 

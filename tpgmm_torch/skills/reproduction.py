@@ -23,7 +23,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import PART
 from tpgmm_torch.skills.holding import Holding
-from tpgmm_torch.skills.situations import completed_situations, with_novelty
+from tpgmm_torch.skills.situations import complete_situations, with_novelty
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 
@@ -57,7 +57,7 @@ def reproduce(
     DataError, ShapeError, UnknownNameError, PlausibilityError
         If a situation does not fit the skill, or cannot be what it is taken for.
     """
-    known = completed_situations(skill, situations)
+    known = complete_situations(skill, situations)
     trajectories: dict[int, Trajectory] = {}
     for members in _groups(known):
         batch = [known[index] for index in members]
@@ -156,7 +156,7 @@ def _run_together(
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
     assert time is not None  # they are complete
-    frames = _stacked(situations)
+    frames = _stack_frames(situations)
     start = torch.stack([situation.joints for situation in situations])
     joints, poses = start, frames
     if len(situations) == 1:  # one robot is computed faster without a batch
@@ -179,7 +179,7 @@ def _run_together(
     ]
 
 
-def _stacked(situations: Sequence[Situation]) -> dict[str, Frame]:
+def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
     """Frames of B situations, (B,) or, if they move, (T, B)."""
     return {
         name: Frame.stack([situation.frames[name] for situation in situations])

@@ -264,9 +264,9 @@ class Sequence(CompositeSkill):
         one = passed.new_ones(*passed.shape[:-1], 1)
         return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
 
-    def observed(self, names: frozenset[str]) -> Skill | None:
-        """See :meth:`Skill.observed`."""
-        several = [one.observed(names) for one in self.skills]
+    def restrict_to(self, names: frozenset[str]) -> Skill | None:
+        """See :meth:`Skill.restrict_to`."""
+        several = [one.restrict_to(names) for one in self.skills]
         known = tuple(one for one in several if one is not None)
         return self.with_skills(known) if len(known) == len(several) else None
 

@@ -20,17 +20,15 @@ from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
     "at_first",
-    "completed_frames",
-    "completed_situations",
+    "complete_frames",
+    "complete_situations",
     "report_start",
     "tick_inputs",
     "with_novelty",
 ]
 
 
-def completed_frames(
-    skill: Skill, joints: Any, frames: Mapping[str, Frame]
-) -> dict[str, Frame]:
+def complete_frames(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     """Frames, and those that are not given but follow from the start posture.
 
     Parameters
@@ -58,7 +56,7 @@ def completed_frames(
     return complete
 
 
-def completed_situations(
+def complete_situations(
     skill: Skill, given: Situation | Demonstration | Iterable[Situation | Demonstration]
 ) -> list[Situation]:
     """Situations in the robot's joint order, with all frames and a time grid, and reported.
@@ -76,7 +74,7 @@ def completed_situations(
     if not isinstance(given, Situation | Demonstration | Iterable):
         raise DataError(f"situations are a list of Situation, got {type(given).__name__}")
     several = [given] if isinstance(given, Situation | Demonstration) else list(given)
-    situations = [_completed(skill, one) for one in several]
+    situations = [_complete(skill, one) for one in several]
     if situations:
         firsts = [at_first(one) for one in situations]
         report = check_situations(
@@ -91,7 +89,7 @@ def completed_situations(
     return situations
 
 
-def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
+def _complete(skill: Skill, given: Situation | Demonstration) -> Situation:
     names, like = skill.kinematics.joint_names, skill.kinematics.lower
     if isinstance(given, Demonstration):
         given = Situation.of(given)
@@ -103,7 +101,7 @@ def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
             f"the start posture has {len(given.joints)} joints, the model has {len(names)}: "
             f"{names}"
         )
-    complete = completed_frames(skill, given.joints, given.frames)
+    complete = complete_frames(skill, given.joints, given.frames)
     time = skill.time if given.time is None else given.time.to(like)
     present = {**complete, **given.frames_at(time)}
     frames = {name: present[name].to(like) for name in skill.frame_names}

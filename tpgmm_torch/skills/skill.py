@@ -171,7 +171,7 @@ class Skill(Protocol):
         """
         ...
 
-    def observed(self, names: frozenset[str]) -> Skill | None:
+    def restrict_to(self, names: frozenset[str]) -> Skill | None:
         """The skill of those operators whose frames and links are observed.
 
         Parameters
@@ -365,7 +365,7 @@ class CompositeSkill(Skill):
         for k, skill in enumerate(self.skills):
             weight = shares[..., k]
             for one in skill.expected_forces(self.time_of(k, time)):
-                part = one.scaled(weight)
+                part = one.scale(weight)
                 before = found.get(one.operator)
                 found[one.operator] = part if before is None else before.plus(part)
         return tuple(found.values())

@@ -29,7 +29,14 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "aligner", "learn", "operators_or_default", "parse_parts", "prepared"]
+__all__ = [
+    "Choices",
+    "aligner",
+    "learn",
+    "operators_or_default",
+    "parse_parts",
+    "prepare_demonstrations",
+]
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,7 @@ def operators_or_default(
     return default_operators(links, frames)
 
 
-def prepared(
+def prepare_demonstrations(
     aligned: Sequence[Demonstration],
     operators: Sequence[Operator],
     robot: Kinematics | None,
@@ -164,7 +171,7 @@ def learn(
     model : TaskParameterizedGMM
         Unfitted.
     source : sequence of Demonstration, or iterable of batches
-        As :func:`prepared` gives them.
+        As :func:`prepare_demonstrations` gives them.
     choices : Choices
     processes : Processes
 

@@ -59,7 +59,7 @@ class Evidence:
     floor: Tensor
     degrees: float
 
-    def _fused(self, operators: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def _fuse(self, operators: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Covariance and mean (..., n, 1) of the product of some operators' Gaussians."""
         precision, vector = self.nothing
         for operator in operators:
@@ -70,7 +70,7 @@ class Evidence:
 
     def log_likelihood(self, operators: Sequence[int]) -> Tensor:
         """Of the demonstrations left out, given some operators by number, in nats, (M, T)."""
-        covariance, step = self._fused(operators)
+        covariance, step = self._fuse(operators)
         floored, name = covariance + self.floor.diag(), "the covariance of what is expected"
         return gaussians.log_density(step, floored, name, self.degrees)[..., 0]
 
@@ -89,7 +89,7 @@ class Evidence:
             From what the operator expects, and from what the others do, as far as the joints
             can tell: in metres, radians, or numbers of a quaternion.
         """
-        _, step = self._fused(others)
+        _, step = self._fuse(others)
         of_others = (self.jacobians[operator] @ step)[..., 0]
         own, other = (x.square().sum(-1).mean(0) for x in (self.residuals[operator], of_others))
         return own.sqrt(), other.sqrt()

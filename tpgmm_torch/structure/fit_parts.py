@@ -55,7 +55,7 @@ def fit_parts(
     edges = _edges(known, cuts)
     stretches = list(pairwise(edges))
     if isinstance(operators, SelectOperators):
-        operators = [_selected(operators, known, *own) for own in stretches]
+        operators = [_select_for(operators, known, *own) for own in stretches]
     of_parts = [model.operators] * len(stretches) if operators is None else list(operators)
     if len(of_parts) != len(stretches):
         raise DataError(f"there are operators for {len(of_parts)} of {len(stretches)} parts")
@@ -81,7 +81,7 @@ def _edges(known: Sequence[Demonstration], cuts: Sequence[float | str]) -> list[
     return edges
 
 
-def _selected(
+def _select_for(
     select: SelectOperators, known: Sequence[Demonstration], begin: float, end: float
 ) -> tuple[Operator, ...]:
     """The operators that matter from ``begin`` to ``end``."""

@@ -33,7 +33,7 @@ from tpgmm_torch.training.hold_detection import demonstrated_holds, with_holds
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
-__all__ = ["Judgement", "SelectOperators", "arranged", "candidate_operators"]
+__all__ = ["Judgement", "SelectOperators", "arrange", "candidate_operators"]
 
 POSITIONS = AbsolutePosition, RelativePosition
 ORIENTATIONS = AbsoluteOrientation, RelativeOrientation
@@ -210,7 +210,7 @@ class SelectOperators(DemonstrationEstimator):
         chosen = self._chosen(evidence, operators)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
-        self.operators_ = arranged([operators[j] for j in chosen])
+        self.operators_ = arrange([operators[j] for j in chosen])
         judged = [self._judge(evidence, j, chosen, kinematics) for j in range(len(operators))]
         self.judgements_ = tuple(judgement for judgement, _ in judged)
         self.relevance_ = torch.stack([gains for _, gains in judged], -1).cpu().numpy()
@@ -244,7 +244,7 @@ class SelectOperators(DemonstrationEstimator):
         def mean(*operators: int) -> float:
             return float(evidence.log_likelihood(operators).mean())
 
-        chosen = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
+        chosen = [j for j, one in enumerate(operators) if one.is_posture]
         while rest := [j for j in range(len(operators)) if j not in chosen]:
             best = max(rest, key=lambda j: mean(*chosen, j))
             if chosen and mean(*chosen, best) - mean(*chosen) <= self.threshold:
@@ -263,18 +263,18 @@ class SelectOperators(DemonstrationEstimator):
     ) -> tuple[Judgement, Tensor]:
         """Gain of candidate j, when it counts, its own units; and its gains (T,)."""
         operator, others = self.candidates_[j], _without(chosen, j)
-        joints = [i for i, one in enumerate(self.candidates_) if isinstance(one, Canonical)]
+        joints = [i for i, one in enumerate(self.candidates_) if one.is_posture]
         base = [] if j in joints else joints
 
-        def gained(beside: Sequence[int]) -> Tensor:
+        def gain(beside: Sequence[int]) -> Tensor:
             with_it = evidence.log_likelihood([*beside, j])
             return (with_it - evidence.log_likelihood(beside)).mean(0)
 
-        gains = gained(others)
+        gains = gain(others)
         peak = int(gains.argmax())
         factor, unit = _unit(operator, evidence.jacobians[j].shape[-2], kinematics)
         error, of_others = (float(each[peak]) * factor for each in evidence.errors(j, others))
-        numbers = float(gains.mean()), float(gained(base).mean()), float(evidence.time[peak])
+        numbers = float(gains.mean()), float(gain(base).mean()), float(evidence.time[peak])
         judgement = Judgement(operator, j in chosen, *numbers, error, of_others, unit)
         return judgement, gains
 
@@ -326,12 +326,12 @@ def _without(chosen: Sequence[int], dropped: int) -> list[int]:
     return [j for j in chosen if j != dropped]
 
 
-def arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
+def arrange(operators: Sequence[Operator]) -> tuple[Operator, ...]:
     """Of some ``operators``, what refers to one place stacked, joints behind it."""
     groups: dict[Any, list[Operator]] = {}
     joints = []
     for operator in operators:
-        if isinstance(operator, Canonical):
+        if operator.is_posture:
             joints.append(operator)
         else:
             place = operator.references(), operator.links()[1:]

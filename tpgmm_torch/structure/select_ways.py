@@ -272,13 +272,13 @@ class SelectWays(DemonstrationEstimator):
             for along in _axes(means)
         ]
         cost = math.log(max(len(places), 1))
-        splits = [_divided(*place, cost, most, self._given) for place in places]
+        splits = [_divide_along(*place, cost, most, self._given) for place in places]
         best = sorted(filter(None, splits), key=lambda split: split.worth)
         if self._given:
             return next(iter(best), None)
-        return next((one for one in best if not self._explained(one, views)), None)
+        return next((one for one in best if not self._is_explained(one, views)), None)
 
-    def _explained(self, split: _Split, views: Sequence[_View]) -> bool:
+    def _is_explained(self, split: _Split, views: Sequence[_View]) -> bool:
         """Whether a shift in time explains a division, or what is seen at the start."""
         return self._late(split) or _situational(split, views)
 
@@ -298,7 +298,7 @@ class SelectWays(DemonstrationEstimator):
         return bool(shifted[~same].min() <= max(nearest.max(), split.view.near))
 
 
-def _divided(
+def _divide_along(
     view: _View, stretch: int, along: Array, cost: float, most: int, given: int | None
 ) -> _Split | None:
     """The best division along one axis of one stretch, if there is more than one mode."""

@@ -50,7 +50,7 @@ from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.structure.choices import Choices, aligner, learn, prepared
+from tpgmm_torch.structure.choices import Choices, aligner, learn, prepare_demonstrations
 from tpgmm_torch.training.hold_detection import holding_as_in, with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
@@ -251,7 +251,7 @@ class Learner:
         config, operators = self._config, self._operators
         log.info("EM: fitting %s components", config.n_components)
         robust, holds = config.training.robust, config.given_holds()
-        shown = prepared(aligned, operators, model.robot, robust, holds)
+        shown = prepare_demonstrations(aligned, operators, model.robot, robust, holds)
         self._model, reports = learn(model, shown, self._choices)
         for report in reports:
             log.info("%s", report)
@@ -284,7 +284,7 @@ class Learner:
             model = self._regression(kinematics.to(like.dtype, like.device))
 
             def expected(j: int, time: Tensor) -> Tensor:
-                return model.expected(j, time.to(like)).to(time)
+                return model.expect(j, time.to(like)).to(time)
 
             rows = torch.cat(local_data(kept, operators, kinematics, expected, holds))
             points = list(rows.to(like).split([mean.shape[1] for mean in mixture.means], 1))

@@ -81,7 +81,7 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
     points = []
     for j, operator in enumerate(model.operators):
         local = operator.at(samples.time).coordinates(samples.state, samples.poses)
-        expected = model.expected(j, samples.time)
+        expected = model.expect(j, samples.time)
         starts = operator.quaternion_starts(model.kinematics)
         local = quaternions.match_hemisphere(local, expected, starts)
         points.append(torch.cat((samples.time[:, None], local), dim=1))

@@ -125,7 +125,7 @@ def test_what_em_left_out_is_not_learned_by_gradient(tmp_path):
 def test_the_loss_is_the_log_density_that_em_raises(handlings):
     policy = trained(handlings, alignment="none", **HANDLINGS)
     model, shown = policy.to_estimator(), load_lerobot(handlings.root)
-    expected = model.skill.expected
+    expected = model.skill.expect
     rows = torch.cat(local_data(shown, model.operators_, model.kinematics_, expected))
     loss = value(policy, whole(handlings))
     assert loss == pytest.approx(-model.mixture_.score(rows.numpy()), rel=1e-9)

@@ -29,7 +29,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import save
-from tpgmm_torch.structure.choices import prepared
+from tpgmm_torch.structure.choices import prepare_demonstrations
 
 __all__ = ["GENERATED", "UPLOADED", "Skill", "learn", "moved", "page", "places_of", "show"]
 
@@ -131,7 +131,7 @@ def learn(
                 int(n_components), operators, kinematics, random_state=0
             )
             aligned = align(read, "dtw", kinematics)
-            model.fit(prepared(aligned, operators, kinematics))
+            model.fit(prepare_demonstrations(aligned, operators, kinematics))
     except Exception as error:
         return None, _refusal(error)
     seconds = [one.duration for one in read]

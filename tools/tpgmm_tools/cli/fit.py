@@ -32,7 +32,6 @@ from tpgmm_torch.structure.choices import (
     learn,
     operators_or_default,
     parse_parts,
-    prepared,
 )  # fmt: skip
 from tpgmm_torch.training.hold_detection import with_holds
 
@@ -160,7 +159,7 @@ def fit(
             fitted = fitted and fitted.fit(first)
             first = fitted.transform(first) if fitted else first
         model.operators = operators_or_default(operators, robot, list(first[0].frames))
-        kept = prepared(first, model.operators, robot, robust, holds)
+        kept = prepare_demonstrations(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
             _echo(_recording_summary(recording, read, kept, described.link, not operator))
         episodes = processes.share(kept)

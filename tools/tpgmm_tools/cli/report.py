@@ -65,13 +65,13 @@ def report(
 
     from tpgmm_tools.report import write_report
     from tpgmm_torch.persistence import load_model
-    from tpgmm_torch.structure.choices import prepared
+    from tpgmm_torch.structure.choices import prepare_demonstrations
 
     torch.set_num_threads(1)
     fitted = load_model(model, device="cpu")
     robot = fitted.kinematics_
     shown = options.align(data.read(dataset, robot), alignment, robot)
-    shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
+    shown = prepare_demonstrations(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
     options.check_situation(situation, len(shown))
     how = options.look(object_, meshes, obstacles, visuals, fitted.skill, shown)
     place = out or Path(f"{model}.html")
