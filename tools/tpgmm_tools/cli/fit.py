@@ -32,6 +32,7 @@ from tpgmm_torch.structure.choices import (
     learn,
     operators_or_default,
     parse_parts,
+    prepare_demonstrations,
 )  # fmt: skip
 from tpgmm_torch.training.hold_detection import with_holds
 
