@@ -425,20 +425,28 @@ class Residual:
         moved = mean if at.matrix is None else (at.matrix @ mean.unsqueeze(-1))[..., 0]
         residual, jacobian = moved + at.displacement, at.jacobian
         # orientations that are tracked have four rows, which are linear in the joints
-        if jacobian is None or residual.shape[-1] != 3 * len(self.leaves):
-            return matrix, residual, jacobian, at.noise
-        own, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
-        if self.turning is not None:
-            assert present is not None  # there are quaternions
-            share, whole, half = self.turning
-            cosine = whole + (mean * present) @ share
-            own = cosine[..., None, None] * own + _cross(half * still, own)
+        if jacobian is not None and residual.shape[-1] == 3 * len(self.leaves):
+            cosine = None
+            if self.turning is not None:
+                assert present is not None  # there are quaternions
+                cosine = self.turning[1] + (mean * present) @ self.turning[0]
+            jacobian = self._turn_jacobian(jacobian, residual, cosine, state)
+        return matrix, residual, jacobian, at.noise
+
+    def _turn_jacobian(
+        self, jacobian: Tensor, residual: Tensor, cosine: Tensor | None, state: RobotState
+    ) -> Tensor:
+        """Add to a linearisation's Jacobian what a rotation that is still to go adds."""
+        rows, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
+        if cosine is not None and self.turning is not None:
+            rows = cosine[..., None, None] * rows + _cross(self.turning[2] * still, rows)
         for row, leaf in enumerate(self.leaves):
             if leaf is None or (reference := leaf.moving_reference(state)) is None:
                 continue
-            own = own.expand(*still.shape, -1).clone()
-            own[..., row, :, :] += _cross(still[..., row, :], state.angular_jacobian(reference))
-        return matrix, residual, own.flatten(-3, -2), at.noise
+            rows = rows.expand(*still.shape, -1).clone()
+            angular = state.angular_jacobian(reference)
+            rows[..., row, :, :] += _cross(still[..., row, :], angular)
+        return rows.flatten(-3, -2)
 
 
 def _cross(vector: Tensor, matrix: Tensor) -> Tensor:

@@ -267,23 +267,23 @@ class Regression:
 
         Of a stack of operators, those of which all frames and links are observed are kept.
         """
-        if names in self._restrictions:
-            return self._restrictions[names]
+        if names not in self._restrictions:
+            self._restrictions[names] = self._restrict_to(names)
+        return self._restrictions[names]
+
+    def _restrict_to(self, names: frozenset[str]) -> Regression | None:
         pairs = zip(self.operators, self.conditionals, strict=True)
         every = enumerate(self._part(operator, one, names) for operator, one in pairs)
         kept = {index: part for index, part in every if part is not None}
-        operators = tuple(operator for operator, _ in kept.values())
-        found: Regression | None = None
+        operators, fusion = tuple(operator for operator, _ in kept.values()), self.fusion
         if list(operators) == list(self.operators):
-            found = self
-        elif of_joints(operators):
-            _, conditionals = zip(*kept.values(), strict=True)
-            fusion = self.fusion
-            if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
-                fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
-            found = replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
-        self._restrictions[names] = found
-        return found
+            return self
+        if not of_joints(operators):
+            return None
+        if fusion.priorities is not None:
+            fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
+        _, conditionals = zip(*kept.values(), strict=True)
+        return replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
 
     def _part(
         self, operator: Operator, one: Conditionals, names: frozenset[str]

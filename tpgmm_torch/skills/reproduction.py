@@ -84,7 +84,7 @@ def open_loop(
         [s].
     """
     moving = {name for name, pose in poses.items() if len(pose.batch_shape) >= start.ndim}
-    here = {name: pose[0] if name in moving else pose for name, pose in poses.items()}
+    here = _poses_at(0, poses, moving)
     holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, here)
     skill, joints, last = skill.start(start, here), start, None
     done, inferring = list[Tick](), torch.is_inference_mode_enabled()
@@ -92,11 +92,11 @@ def open_loop(
         if now == last:
             done.append(done[-1])
             continue
-        seen = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
+        seen = _poses_at(k, poses, moving) if moving else None
         time = start.new_tensor(now)
         # what the first step does not record, none does; to ask so takes a third
         with torch.inference_mode(inferring or (k > 0 and not done[0][0].requires_grad)):
-            holding = holding.advance(time, joints, seen if moving else None)
+            holding = holding.advance(time, joints, seen)
             state: Any = joints
             if holding.carries:
                 state = holding.state(skill.kinematics.state(joints))
@@ -105,6 +105,11 @@ def open_loop(
         done.append((joints, found, holding))
         last = now
     return done
+
+
+def _poses_at(k: int, poses: Mapping[str, Frame], moving: set[str]) -> dict[str, Frame]:
+    """Select the poses at an instant, where they move."""
+    return {name: pose[k] if name in moving else pose for name, pose in poses.items()}
 
 
 def sample(

@@ -71,22 +71,24 @@ def complete_situations(
     DataError, ShapeError, UnknownNameError, PlausibilityError
         If one does not fit the skill, or cannot be what it is taken for.
     """
-    if not isinstance(given, Situation | Demonstration | Iterable):
+    if isinstance(given, Situation | Demonstration):
+        given = [given]
+    if not isinstance(given, Iterable):
         raise DataError(f"situations are a list of Situation, got {type(given).__name__}")
-    several = [given] if isinstance(given, Situation | Demonstration) else list(given)
-    situations = [_complete(skill, one) for one in several]
+    situations = [_complete(skill, one) for one in given]
     if situations:
-        firsts = [at_first(one) for one in situations]
-        report = check_situations(
-            torch.stack([one.joints for one in situations]),
-            {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]},
-            torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
-            skill.kinematics,
-            _span(skill),
-            skill.summaries,
-        )
-        report.act()
+        _report(skill, situations)
     return situations
+
+
+def _report(skill: Skill, situations: Sequence[Situation]) -> None:
+    """Compare complete situations with the demonstrations."""
+    firsts = [at_first(one) for one in situations]
+    times = [one.time[[0, -1]] for one in situations if one.time is not None]
+    joints = torch.stack([one.joints for one in situations])
+    frames = {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]}
+    now = torch.stack(times), skill.kinematics, _span(skill), skill.summaries
+    check_situations(joints, frames, *now).act()
 
 
 def _complete(skill: Skill, given: Situation | Demonstration) -> Situation:

@@ -102,12 +102,10 @@ class ViaPoints(CompositeSkill):
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """Estimate the skill, given the via-points; see :meth:`Skill.estimate`."""
-        whole = state if isinstance(state, RobotState) else None
-        joints = state if isinstance(state, Tensor) else state.joints
+        joints, held = (state, None) if isinstance(state, Tensor) else (state.joints, state)
         if self._shift is not None and self._shift.shape == joints.shape:
             joints = joints - self._shift  # of other robots than those of the last tick: none
-        held = whole if whole is not None and whole.carriers else None
-        around = Surroundings(self.skill, frames, held)
+        around = Surroundings(self.skill, frames, held if held and held.carriers else None)
         free = around.estimate(time, joints, bounds)
         skill = self.skill.advance(free)
         if not any(cluster.counts(time) for cluster in self._clusters):
@@ -116,6 +114,14 @@ class ViaPoints(CompositeSkill):
         if not bool(free.joints.isfinite().all()):  # of whom it cannot be told: as it was
             kept = free.joints if self._shift is None else free.joints + self._shift
             return replace(free, joints=kept, after=replace(self, skill=skill))
+        given, shift, moved = self._condition(time, free, around)
+        after = replace(self, skill=skill, _shift=shift, _moved=moved)
+        return replace(keep_within(given, bounds), after=after)
+
+    def _condition(
+        self, time: Tensor, free: Estimate, around: Surroundings
+    ) -> tuple[Estimate, Tensor, tuple[Tensor | None, ...]]:
+        """Condition an estimate on all clusters; also return ``e_t``, and ``e_a`` of each."""
         here, moved = around.estimate(time, free.joints), list[Tensor | None]()
         shift, covariance = torch.zeros_like(here.joints), here.covariance
         for cluster, last in zip(self._clusters, self._moved, strict=True):
@@ -125,8 +131,7 @@ class ViaPoints(CompositeSkill):
                 shift, covariance = shift + more, covariance - narrowed
             moved.append(there)
         given = replace(free, joints=here.joints + shift, covariance=covariance)
-        after = replace(self, skill=skill, _shift=shift, _moved=tuple(moved))
-        return replace(keep_within(given, bounds), after=after)
+        return given, shift, tuple(moved)
 
     def candidates(
         self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate

@@ -115,16 +115,10 @@ def operators_or_default(
     PlausibilityWarning
         If links are seen from no object, though there are objects.
     """
-    links = () if robot is None else robot.links
     if given:
-        moving = [link for one in given for link in one.links()]
-        if frames and robot is not None and moving and not frame_names(given, robot):
-            warnings.warn(
-                f"none of the operators refers to the objects {list(frames)}: LINK@FRAME does",
-                PlausibilityWarning,
-                stacklevel=2,
-            )
+        _warn_of_unseen(given, robot, frames)
         return list(given)
+    links = () if robot is None else robot.links
     if frames and not links:
         model = getattr(robot, "model", None)
         what = f"of {list(model.links)}" if model else "with --robot (--policy.robot)"
@@ -134,6 +128,19 @@ def operators_or_default(
             """--operator canonical (--policy.operators='["canonical"]')"""
         )
     return default_operators(links, frames)
+
+
+def _warn_of_unseen(
+    operators: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
+) -> None:
+    """Warn if links are seen from no object, though there are objects."""
+    moving = any(one.links() for one in operators)
+    if frames and robot is not None and moving and not frame_names(operators, robot):
+        warnings.warn(
+            f"none of the operators refers to the objects {list(frames)}: LINK@FRAME does",
+            PlausibilityWarning,
+            stacklevel=3,
+        )
 
 
 def prepare_demonstrations(
