@@ -388,7 +388,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         summary: TrainingSummary | None = None,
         **settings: Any,
     ) -> Self:
-        """A fitted model of known parameters, which are kept as they are.
+        """Return a fitted model of known parameters, which are kept as they are.
 
         Parameters
         ----------

@@ -117,7 +117,7 @@ class Operator(ABC):
         return (0.0,) * self.dimension(kinematics)
 
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
-        """The unit of each coordinate; None, the default, if it is like no other.
+        """Return the unit of each coordinate; None, the default, if it is like no other.
 
         Variances of one unit are learned together from few demonstrations.
         """

@@ -97,7 +97,7 @@ class Canonical(Operator):
         return tuple(map(known.get, self.columns(kinematics.joint_names)))
 
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """The number of joints."""
+        """Return the number of joints."""
         if kinematics is None:
             raise DataError("Canonical() has as many coordinates as the robot has joints")
         return len(self.columns(kinematics.joint_names))

@@ -142,7 +142,7 @@ class _Orientation(PoseOperator):
         return quaternions.log(seen) if self._tangent else seen
 
     def is_bilinear(self, state: RobotState) -> bool:
-        """Whether :func:`linearize_poses` serves: not in tangent space, nor for tracked poses.
+        """Check that :func:`linearize_poses` serves: not in tangent space, nor for tracked poses.
 
         Where a link's quaternion is part of the joint vector nothing has to be linearised.
         """

@@ -52,11 +52,11 @@ class PoseOperator(Operator):
         return getattr(self, "frame", None)
 
     def links(self) -> tuple[str, ...]:
-        """The link; the frame too, if it is the held object that is meant."""
+        """Return the link; the frame too, if it is the held object that is meant."""
         return (self.link, self._frame) if self._frame and self.held else (self.link,)
 
     def references(self) -> tuple[str, ...]:
-        """The frame, if it is a place."""
+        """Return the frame, if it is a place."""
         return (self._frame,) if self._frame and not self.held else ()
 
     def text(self) -> str:
@@ -77,11 +77,11 @@ class PoseOperator(Operator):
         return self._frame if self._frame in moving else None
 
     def is_bilinear(self, state: RobotState) -> bool:
-        """Whether :func:`linearize_poses` serves."""
+        """Check that :func:`linearize_poses` serves."""
         return True
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """The row of eq. (6) for a position, of eq. (11) for an orientation.
+        """Return the row of eq. (6) for a position, of eq. (11) for an orientation.
 
         ``J (q - q_{t-1}) = R mu + p - x_{t-1}``, and
         ``J (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``.
@@ -94,7 +94,7 @@ class PoseOperator(Operator):
     def poses(
         self, state: RobotState, frames: Mapping[str, Frame]
     ) -> tuple[Frame, Frame | None]:
-        """Of what is seen, and of what it is seen from; None is the base frame."""
+        """Return the poses of what is seen and of what it is seen from, None for the base."""
         body = (
             state.pose(self.link)
             if self.link in state.links

@@ -70,7 +70,7 @@ class Stack(Operator):
         return leaves(self.operators)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """The sum of the dimensions."""
+        """Return the sum of the dimensions."""
         return sum(operator.dimension(kinematics) for operator in self.operators)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
@@ -84,7 +84,7 @@ class Stack(Operator):
         return parts[0] if len(parts) == 1 else _stack_rows(parts, state.joints)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """The coordinates side by side."""
+        """Return the coordinates side by side."""
         parts = [operator.coordinates(state, frames) for operator in self.operators]
         return _join(parts, gaussians.common_shape(*(part.shape[:-1] for part in parts)), 1)
 
@@ -109,7 +109,7 @@ class Stack(Operator):
         return tuple(v for o in self.operators for v in o.path_variances(kinematics))
 
     def at(self, time: Tensor) -> Operator:
-        """The stack of the members at a time."""
+        """Return the stack of the members at a time."""
         members = [operator.at(time) for operator in self.operators]
         return self if all(map(is_, members, self.operators)) else Stack(*members)
 

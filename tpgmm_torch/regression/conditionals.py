@@ -26,7 +26,7 @@ def _degrees_of_freedom(n_samples: float) -> float:
 
 
 def predictive_scale(n_samples: float | None) -> float:
-    """How much wider a new sample spreads than the covariance of n samples says.
+    """Compute how much wider a new sample spreads than the covariance of n samples says.
 
     ``(n + 1) / (n - 1)``, which Student's t has for its scale matrix.
 
@@ -149,7 +149,7 @@ class Conditionals(_OfComponents):
         return self.mean.square() + variance + moved
 
     def marginal(self, coordinates: Tensor) -> Conditionals:
-        """Of some of the coordinates, by their indices."""
+        """Select some of the coordinates, by their indices."""
         covariance = self.covariance[:, coordinates][:, :, coordinates]
         return replace(
             self,
@@ -235,7 +235,7 @@ class ActiveComponents:
         return self._sets[bisect.bisect_right(self._edge_list, time)]
 
     def counts(self, time: Tensor) -> Tensor:
-        """Whether each component counts at times of shape (...): bool of shape (..., K)."""
+        """Check which components count at times of shape (...): bool of shape (..., K)."""
         instants = time.detach().double().cpu().contiguous()
         window = torch.bucketize(instants, self._edges, right=True)
         return self._counts[window].to(time.device)

@@ -120,7 +120,7 @@ class KalmanUpdate:
 
     @staticmethod
     def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
-        """Whether these operators can be fused in this way.
+        """Check that these operators can be fused in this way.
 
         Parameters
         ----------
@@ -204,5 +204,5 @@ class KalmanUpdate:
 
 
 def _whole(operator: Operator) -> bool:
-    """Whether an operator is all of the joints."""
+    """Check that an operator is all of the joints."""
     return type(operator) is Canonical and operator.determines_joints

@@ -103,7 +103,7 @@ class PostureSearch:
         asked: Tensor,
         state_at: Callable[[Tensor], RobotState] | None = None,
     ) -> tuple[Tensor, Self]:
-        """The nearest posture of each robot, and the search for the next tick.
+        """Return the nearest posture of each robot, and the search for the next tick.
 
         Parameters
         ----------
@@ -146,11 +146,11 @@ class PostureSearch:
         return wanted, searched
 
     def reset(self) -> Self:
-        """The same before any robot is searched for."""
+        """Return the same before any robot is searched for."""
         return replace(self, active=None, postures=None, damping=None, age=None)
 
     def drop_robots(self, robots: Tensor) -> Self:
-        """The same without the searches of robots (...) that were displaced."""
+        """Return the same without the searches of robots (...) that were displaced."""
         active = None if self.active is None else self.active & ~robots
         if active is None or not bool(active.any()):
             return self.reset()
@@ -255,7 +255,7 @@ def descend(
     lower: Tensor,
     upper: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """A step of Levenberg's and Marquardt's method within bounds, with one evaluation.
+    """Return a step of Levenberg's and Marquardt's method within bounds, with one evaluation.
 
     Parameters
     ----------

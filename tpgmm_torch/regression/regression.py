@@ -133,7 +133,7 @@ class Regression:
 
     @classmethod
     def of(cls, learned: Learned, fusion: Fusion, *, moderated: bool) -> Self:
-        """A learned mixture, conditioned on time (eqs 1 to 3).
+        """Return a learned mixture, conditioned on time (eqs 1 to 3).
 
         Parameters
         ----------
@@ -231,7 +231,7 @@ class Regression:
         return torch.softmax(self.marginals.log_activation(time.unsqueeze(-1)), -1)
 
     def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
-        """Of each :class:`Wrench` at times (...); see :meth:`Skill.expected_forces`."""
+        """Expect the force of each :class:`Wrench` at times (...); see :meth:`Skill.expected_forces`."""
         first, found = len(of_joints(self.operators)), []
         pairs = zip(self.operators[first:], self.conditionals[first:], strict=True)
         for operator, one in pairs:
@@ -263,7 +263,7 @@ class Regression:
             return torch.from_numpy(self._likelihoods[key](state, frames, window))
 
     def restrict_to(self, names: frozenset[str]) -> Regression | None:
-        """The mixture of observed operators; see :meth:`Skill.restrict_to`.
+        """Return the mixture of observed operators; see :meth:`Skill.restrict_to`.
 
         Of a stack of operators, those of which all frames and links are observed are kept.
         """
@@ -288,7 +288,7 @@ class Regression:
     def _part(
         self, operator: Operator, one: Conditionals, names: frozenset[str]
     ) -> tuple[Operator, Conditionals] | None:
-        """The part of an operator that needs no other frames and links than these."""
+        """Return the part of an operator that needs no other frames and links than these."""
         members = leaves([operator])
         there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
         if all(there):
@@ -301,7 +301,7 @@ class Regression:
         return Stack(*seen), one.marginal(columns)
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
-        """The same for all robots; see :meth:`Skill.start`."""
+        """Return the same for all robots; see :meth:`Skill.start`."""
         return self
 
     def of_robots(self, robots: Tensor) -> Regression:
@@ -309,7 +309,7 @@ class Regression:
         return self
 
     def advance(self, estimate: Estimate) -> Regression:
-        """The same at all ticks; see :meth:`Skill.advance`."""
+        """Return the same at all ticks; see :meth:`Skill.advance`."""
         return self
 
     def posture_search(self) -> PostureSearch:
@@ -348,7 +348,7 @@ class Regression:
         return torch.logsumexp(total, -1)
 
     def surprise(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> Tensor:
-        """How much less likely local coordinates are than those that are expected [nats].
+        """Compute how much less likely local coordinates are than those expected [nats].
 
         Parameters
         ----------
@@ -505,7 +505,7 @@ class Regression:
 
     @cached_property
     def _active(self) -> ActiveComponents | None:
-        """Which components count when, where not all do at any time."""
+        """Components that count at each time, where not all do at any."""
         learning = self.log_weights.requires_grad or self.conditionals[0].mean.requires_grad
         fusion = self.fusion
         if fusion.activation != "time" or fusion.negligible == 0 or learning:
@@ -579,7 +579,7 @@ class Regression:
         state: Tensor | RobotState,
         frames: Mapping[str, Frame],
     ) -> Estimate:
-        """Of many robots, part by part, of those that are at about the same time."""
+        """Estimate many robots part by part, those together that are at about the same time."""
         if isinstance(state, RobotState):
             state = state.flatten(batch)
         else:

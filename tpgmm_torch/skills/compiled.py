@@ -208,7 +208,7 @@ class CompiledRegression(Regression):
         return {}
 
     def _compile(self, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], Sequence[Tensor]]:
-        """The graph for inputs of such shapes."""
+        """Return the graph for inputs of such shapes."""
         with _tracing():
             examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
             program = _trace(_Fusion(self), examples)
@@ -227,7 +227,7 @@ class CompiledRegression(Regression):
         return len(self.log_weights) if self._active is None else self._active.largest
 
     def _select(self, active: tuple[int, ...]) -> Components:
-        """Of one size within the windows: components that are added have no weight."""
+        """Select as many in all windows: components that are added have no weight."""
         spare = active[:1] * (self._largest - len(active))
         components = super()._select((*active, *spare))
         components.marginals.log_peak[len(active) :] = -torch.inf
@@ -299,7 +299,7 @@ def _tracing() -> Iterator[None]:
 
 
 def _wrap(skill: Regression, purpose: str, backend: str = "inductor") -> CompiledRegression:
-    """The skill with graphs, if it is of a kind that these serve."""
+    """Return the skill with graphs, if it is of a kind that these serve."""
     settings = {field.name: getattr(skill, field.name) for field in fields(Regression)}
     compiled = CompiledRegression(**settings, backend=backend)
     links, task = skill.kinematics.links, compiled._update and compiled._update.task

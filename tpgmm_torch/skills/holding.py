@@ -180,7 +180,7 @@ class Holding:
         dt: float | Tensor = 0.0,
         shares: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> Self:
-        """The next tick.
+        """Return the next tick.
 
         Parameters
         ----------
@@ -228,17 +228,17 @@ class Holding:
         return replace(self, frames=places, held=self.held if held == self.held else held)
 
     def free(self, name: str, like: Tensor) -> Tensor:
-        """For which robots an object is free: bool, of the shape of ``like``."""
+        """Check for which robots an object is free: bool, of the shape of ``like``."""
         carrier = self.held.get(name, FREE).carrier
         return carrier.to(like.device).expand(like.shape) < 0
 
     def busy(self, like: Tensor) -> Tensor:
-        """Which robots hold something: bool, of the shape of ``like``."""
+        """Check which robots hold something: bool, of the shape of ``like``."""
         none = torch.zeros_like(like, dtype=torch.bool)
         return torch.stack([none, *(~self.free(n, like) for n in self.held)]).any(0)
 
     def take(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
-        """A link holds an object, as if that had been given.
+        """Return a link holds an object, as if that had been given.
 
         Parameters
         ----------
@@ -266,7 +266,7 @@ class Holding:
         return replace(self, frames=frames, held={**self.held, name: now})
 
     def clear_override(self, name: str, where: Tensor) -> Self:
-        """The skill's holds of an object count again, whatever was given before.
+        """Return the skill's holds of an object count again, whatever was given before.
 
         Parameters
         ----------
@@ -340,7 +340,7 @@ class Holding:
         given: Mapping[str, str | None],
         where: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """The link that holds an object now, and for which robots that was given."""
+        """Return the link that holds an object now, and for which robots that was given."""
         links, carrier = self.kinematics.links, NOBODY
         for hold in self.holds:
             if hold.frame == name:
@@ -366,7 +366,7 @@ class Holding:
         seen: Frame | None,
         state_now: Callable[[], RobotState],
     ) -> tuple[Held, Frame]:
-        """An object after its carrier may have changed, and its place."""
+        """Return an object after its carrier may have changed, and its place."""
         carrier, given = now_held
         if bool((carrier == before.carrier).all()):
             pose = _unless(before.taken, place if seen is None else seen, place)
@@ -404,7 +404,7 @@ class Holding:
         state_now: Callable[[], RobotState],
         dt: float | Tensor,
     ) -> Held:
-        """An object after it was seen, by robots that held it before."""
+        """Return an object after it was seen, by robots that held it before."""
         if seen is None or before.taken is None or before.apart is None:
             return held
         unseen = _same(seen, before.taken)
@@ -416,7 +416,7 @@ class Holding:
     def _observe(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
     ) -> Held:
-        """A held object after it was seen by some robots."""
+        """Return a held object after it was seen by some robots."""
         assert held.grasp is not None
         grasp, link_pose, moving = held.grasp, held.link, held.moves_along
         dt, then = torch.as_tensor(dt, dtype=grasp.position.dtype), state
@@ -476,7 +476,7 @@ class Holding:
         return replace(held, first=first, last=last, rests=rests & ~moving, shown=shown)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
-        """A state with an object as a link: free for some robots, held by others."""
+        """Return a state with an object as a link: free for some robots, held by others."""
         assert held.grasp is not None
         links = self.kinematics.links
         if not held.carrier.ndim and bool(held.is_held):
@@ -504,14 +504,14 @@ def _constant(like: Frame, value: float) -> Frame:
 
 
 def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
-    """The seen pose; the known one where that is exactly an earlier one."""
+    """Return the seen pose; the known one where that is exactly an earlier one."""
     if stale is None or seen is known:
         return seen
     return choose(_same(seen, stale), known, seen)
 
 
 def _same(one: Frame, other: Frame) -> Tensor:
-    """Where poses are exactly the same."""
+    """Check which poses are exactly the same."""
     same = (one.position == other.position).all(-1)
     return same & (one.orientation == other.orientation).all(-1)
 
@@ -533,7 +533,7 @@ def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
 
 
 def between(one: Frame, other: Frame, share: Tensor) -> Frame:
-    """A pose between two others.
+    """Return a pose between two others.
 
     Parameters
     ----------

@@ -172,7 +172,7 @@ class Skill(Protocol):
         ...
 
     def restrict_to(self, names: frozenset[str]) -> Skill | None:
-        """The skill of those operators whose frames and links are observed.
+        """Return the skill of those operators whose frames and links are observed.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class Skill(Protocol):
         return None
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
-        """The skill for robots that begin with these postures and objects.
+        """Return the skill for robots that begin with these postures and objects.
 
         Parameters
         ----------
@@ -201,7 +201,7 @@ class Skill(Protocol):
         return self
 
     def of_robots(self, robots: Tensor) -> Skill:
-        """The skill for some robots of the batch.
+        """Return the skill for some robots of the batch.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Skill(Protocol):
         return self
 
     def advance(self, estimate: Estimate) -> Skill:
-        """The skill for the next tick, with what it remembers of its last estimate.
+        """Return the skill for the next tick, with what it remembers of its last estimate.
 
         Parameters
         ----------

@@ -139,7 +139,7 @@ class Ways(CompositeSkill):
         return replace(some, chosen=some.chosen[robots])
 
     def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
-        """The way for each robot, and why; each way is tried on a coarse grid of time.
+        """Return the way for each robot, and why; each way is tried on a coarse grid of time.
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class Ways(CompositeSkill):
         return [WayChoice(*part) for part in parts]
 
     def _misfit(self, way: int, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
-        """How much less likely a reproduction is than demonstrations were, (B,) [nats]."""
+        """Compute how much less likely a reproduction is than demonstrations were, (B,) [nats]."""
         skill, worst = self.skills[way], torch.zeros(len(joints), dtype=torch.float64)
         bounds = skill.kinematics.lower, skill.kinematics.upper
         for now in torch.linspace(skill.begin, skill.end, INSTANTS).to(joints):
@@ -195,11 +195,11 @@ class Ways(CompositeSkill):
         return shares[ways.to(time.device)]
 
     def leading(self, times: Tensor) -> Tensor:
-        """The way of each robot, (..., 1): at all times the same."""
+        """Return the way of each robot, (..., 1): at all times the same."""
         return super().leading(times).unsqueeze(-1)
 
     def time_of(self, index: int, time: Tensor) -> Tensor:
-        """A time of the skill, on the clock of one of its ways."""
+        """Return a time of the skill, on the clock of one of its ways."""
         own = self.skills[index]
         share = (time - self.begin) / (self.end - self.begin)
         return own.begin + share * (own.end - own.begin)

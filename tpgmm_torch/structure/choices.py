@@ -95,7 +95,7 @@ def aligner(
 def operators_or_default(
     given: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
 ) -> list[Operator]:
-    """The operators that are given, or all links seen from all frames, and the joints.
+    """Return the operators that are given, or all links seen from all frames, and the joints.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def learn(
 
 
 def parse_parts(text: str | None) -> str | list[float | str] | None:
-    """Where parts end, as ``--parts`` says it: "auto", or seconds and events.
+    """Read where parts end from ``--parts``: "auto", or seconds and events.
 
     Parameters
     ----------

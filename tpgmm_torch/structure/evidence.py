@@ -69,13 +69,13 @@ class Evidence:
         return covariance, covariance @ vector[..., None]
 
     def log_likelihood(self, operators: Sequence[int]) -> Tensor:
-        """Of the demonstrations left out, given some operators by number, in nats, (M, T)."""
+        """Compute that of those left out, given some operators by number, (M, T) [nats]."""
         covariance, step = self._fuse(operators)
         floored, name = covariance + self.floor.diag(), "the covariance of what is expected"
         return gaussians.log_density(step, floored, name, self.degrees)[..., 0]
 
     def errors(self, operator: int, others: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """How far demonstrations left out are from what is expected, root mean square.
+        """Measure how far those left out are from what is expected, root mean square.
 
         Parameters
         ----------

@@ -178,7 +178,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
     def _candidates(
         self, demonstrations: Sequence[Demonstration]
     ) -> tuple[list[Array], list[list[str]]]:
-        """Of each demonstration, where a part may end, as shares of its duration, and why."""
+        """Find where parts may end in each demonstration, as shares of its duration, and why."""
         found = [find_boundaries(one, self.robot) for one in demonstrations]
         phases = [
             np.array([(at.time - float(one.time[0])) / one.duration for at in own])

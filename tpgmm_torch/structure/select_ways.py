@@ -46,7 +46,7 @@ class _View:
     near: float
 
     def of(self, members: NDArray[np.intp]) -> _View:
-        """The same of some of the demonstrations."""
+        """Return the same of some of the demonstrations."""
         return replace(self, values=self.values[members])
 
     @property
@@ -204,7 +204,7 @@ class SelectWays(DemonstrationEstimator):
         return self
 
     def report(self) -> str:
-        """How many modes there are and why, as text.
+        """Report how many modes there are and why, as text.
 
         Raises
         ------
@@ -279,11 +279,11 @@ class SelectWays(DemonstrationEstimator):
         return next((one for one in best if not self._is_explained(one, views)), None)
 
     def _is_explained(self, split: _Split, views: Sequence[_View]) -> bool:
-        """Whether a shift in time explains a division, or what is seen at the start."""
+        """Check whether a shift in time explains a division, or what is seen at the start."""
         return self._late(split) or _situational(split, views)
 
     def _late(self, split: _Split) -> bool:
-        """Whether there is no gap between modes, or none but for who is a little earlier."""
+        """Check whether modes differ by a shift in time: in a little while they meet."""
         values, labels = split.view.values, split.labels
         edges = _edges(values.shape[1])
         now = (edges[split.stretch] + edges[split.stretch + 1]) // 2
@@ -315,7 +315,7 @@ def _divide_along(
 
 
 def _edges(count: int) -> NDArray[np.intp]:
-    """Where stretches of T instants begin and end."""
+    """Divide T instants into stretches: return their edges."""
     number = min(STRETCHES, count)
     return np.linspace(0, count, number + 1).round().astype(np.intp)
 
@@ -363,7 +363,7 @@ def _scatter(values: Array, labels: NDArray[np.intp]) -> tuple[Array, float]:
 
 
 def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Of numbers and their labels under modes of one variance of at least ``near^2``.
+    """Compute that of numbers and their labels under modes of one variance of at least ``near^2``.
 
     It is the restricted one: means are integrated out, from a prior as wide as all numbers,
     because K means of few numbers take much of what tells the variance.
@@ -386,7 +386,7 @@ def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
 
 
 def _situational(split: _Split, views: Sequence[_View]) -> bool:
-    """Whether where demonstrations begin, as some operator sees it, shows the modes too."""
+    """Check whether beginnings, as some operator sees them, show the modes too."""
     one = np.zeros_like(split.labels)
     gains = [
         _log_likelihood(along, split.labels, view.near) - _log_likelihood(along, one, view.near)
