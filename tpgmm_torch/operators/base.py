@@ -51,7 +51,7 @@ class Linearization:
         return jacobian, matrix
 
     def without(self, rigid: Tensor) -> Linearization:
-        """The rows as ``0 = 0``, where the joints cannot change what the operator measures.
+        """Make rows ``0 = 0`` where the joints cannot change what the operator measures.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Operator(ABC):
         return (0.0,) * self.dimension(kinematics)
 
     def at(self, time: Tensor) -> Operator:
-        """The operator at ``time`` (...) [s]: itself, unless its coordinates follow a path."""
+        """Bind it to ``time`` (...) [s]: itself, unless its coordinates follow a path."""
         return self
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:

@@ -83,7 +83,7 @@ class Canonical(Operator):
         return _columns(self.joints, tuple(joint_names))
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance, for every joint; half of it for what is part of a quaternion."""
+        """Return the tolerance of every joint; half of it for parts of a quaternion."""
         tolerances = [self.tolerance] * self.dimension(kinematics)
         for start in self.quaternion_starts(kinematics):
             tolerances[start : start + 4] = [self.tolerance / 2] * 4

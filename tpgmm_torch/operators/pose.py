@@ -72,7 +72,7 @@ class PoseOperator(Operator):
         return _Term(self.link, self._frame, self.held, self.gain)
 
     def moving_reference(self, state: RobotState) -> str | None:
-        """The link or carried object that coordinates are seen from; None if it is a place."""
+        """Return the link or held object that it is seen from; None if that is a place."""
         moving = state.links if self.held else state.robot_links
         return self._frame if self._frame in moving else None
 

@@ -115,7 +115,7 @@ class Conditionals(_OfComponents):
 
     @classmethod
     def stack(cls, parts: Sequence[Conditionals]) -> Conditionals:
-        """The coordinates of all parts side by side, which are independent given time."""
+        """Put coordinates of all parts side by side, which are independent given time."""
         time = parts[0].time_mean, parts[0].time_variance
         covariance = gaussians.block_diagonal([p.covariance for p in parts], time[0].shape)
         mean = torch.cat([part.recenter(time[0]) for part in parts], -1)
@@ -123,7 +123,7 @@ class Conditionals(_OfComponents):
 
     @classmethod
     def product(cls, parts: Sequence[Conditionals]) -> Conditionals:
-        """The product (2) of Gaussians over the same coordinates, component by component.
+        """Multiply (2) Gaussians over the same coordinates, component by component.
 
         Raises
         ------

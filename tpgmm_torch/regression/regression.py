@@ -231,7 +231,7 @@ class Regression:
         return torch.softmax(self.marginals.log_activation(time.unsqueeze(-1)), -1)
 
     def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
-        """Expect the force of each :class:`Wrench` at times (...); see :meth:`Skill.expected_forces`."""
+        """Expect a force for each :class:`Wrench`; see :meth:`Skill.expected_forces`."""
         first, found = len(of_joints(self.operators)), []
         pairs = zip(self.operators[first:], self.conditionals[first:], strict=True)
         for operator, one in pairs:

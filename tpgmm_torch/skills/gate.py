@@ -55,5 +55,5 @@ class Gate:
 
     @property
     def onward(self) -> float:
-        """Time from which the skill goes on when the gate opens: the next skill takes over [s]."""
+        """Time from which the next skill takes over when the gate opens [s]."""
         return self.time + SWITCH * self.fade

@@ -320,7 +320,7 @@ class Holding:
         return self._with(state, name, self.held[name]).pose(name)
 
     def state(self, state: RobotState) -> RobotState:
-        """The state of the robots with the objects that they hold, as operators refer to it.
+        """Add to the state of the robots the objects that they hold, as operators need them.
 
         Parameters
         ----------
@@ -442,7 +442,7 @@ class Holding:
     def _estimate_grasp(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, then: RobotState
     ) -> Held:
-        """A held object that may be shifted in its link, after it was seen by some robots.
+        """Estimate the grasp of an object that may be shifted in its link, after a reading.
 
         Whether it moves with its link is asked of the posture ``then``, as late as it is seen.
         While it rests, it is not late, and its grasp is that of the posture now.

@@ -167,7 +167,7 @@ class Ways(CompositeSkill):
         return [WayChoice(*part) for part in parts]
 
     def _misfit(self, way: int, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
-        """Compute how much less likely a reproduction is than demonstrations were, (B,) [nats]."""
+        """Compute how much less likely a reproduction is than demonstrations, (B,) [nats]."""
         skill, worst = self.skills[way], torch.zeros(len(joints), dtype=torch.float64)
         bounds = skill.kinematics.lower, skill.kinematics.upper
         for now in torch.linspace(skill.begin, skill.end, INSTANTS).to(joints):

@@ -78,7 +78,7 @@ class Choices:
 def aligner(
     method: str, robot: Kinematics | None, features: Sequence[str] | None = None
 ) -> Alignment | Pipeline | None:
-    """The transformer of a name: :func:`parse_alignment`, or "parts", which finds them first.
+    """Make the transformer of a name: :func:`parse_alignment`, or "parts", found first.
 
     Parameters
     ----------

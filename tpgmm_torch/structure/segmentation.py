@@ -156,7 +156,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
         return named
 
     def report(self) -> str:
-        """A table of the boundaries: when they are, why, and how many demonstrations say so."""
+        """Tabulate the boundaries: when they are, why, and how many demonstrations agree."""
         self._check_fitted("boundaries_")
         lines = [
             ("part", "begins at", "earliest", "latest", "found in", "because of"),
@@ -178,7 +178,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
     def _candidates(
         self, demonstrations: Sequence[Demonstration]
     ) -> tuple[list[Array], list[list[str]]]:
-        """Find where parts may end in each demonstration, as shares of its duration, and why."""
+        """Find where parts of each demonstration may end, as shares of it, and why."""
         found = [find_boundaries(one, self.robot) for one in demonstrations]
         phases = [
             np.array([(at.time - float(one.time[0])) / one.duration for at in own])

@@ -214,7 +214,7 @@ class SelectOperators(DemonstrationEstimator):
         return self
 
     def report(self) -> str:
-        """A table of the candidates, those that gain most first: which were kept, and why."""
+        """Tabulate the candidates, those that gain most first: which were kept, and why."""
         self._check_fitted("support_")
         order = sorted(self.judgements_, key=lambda one: (not one.kept, -one.gain, -one.alone))
         lines: list[tuple[str, ...]] = [

@@ -261,7 +261,7 @@ class SelectWays(DemonstrationEstimator):
             self.labels_[members] = mode
 
     def _split(self, views: Sequence[_View]) -> _Split | None:
-        """The best division of some demonstrations; None if BIC says that they are one mode."""
+        """Divide some demonstrations best; None if BIC says that they are one mode."""
         most = min(self._given or self.max_ways, len(views[0].values) // FEWEST)
         if most < 2:
             return None
@@ -301,7 +301,7 @@ class SelectWays(DemonstrationEstimator):
 def _divide_along(
     view: _View, stretch: int, along: Array, cost: float, most: int, given: int | None
 ) -> _Split | None:
-    """The best division along one axis of one stretch, if there is more than one mode."""
+    """Divide along one axis of one stretch; None if there is one mode."""
     partitions = _partitions(along, most)
     scores = np.array([_log_likelihood(along, labels, view.near) for labels in partitions])
     k = np.arange(1, most + 1)
@@ -363,7 +363,7 @@ def _scatter(values: Array, labels: NDArray[np.intp]) -> tuple[Array, float]:
 
 
 def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Compute that of numbers and their labels under modes of one variance of at least ``near^2``.
+    """Compute the log-likelihood of numbers under modes of one variance, at least ``near^2``.
 
     It is the restricted one: means are integrated out, from a prior as wide as all numbers,
     because K means of few numbers take much of what tells the variance.
@@ -397,7 +397,7 @@ def _situational(split: _Split, views: Sequence[_View]) -> bool:
 
 
 def _largest_surprise(skill: Regression, demonstrations: Sequence[Demonstration]) -> float:
-    """The largest surprise of the demonstrations that a skill was learned from [nats]."""
+    """Compute the largest surprise of the demonstrations that a skill learned from [nats]."""
     motions = [Motion.of(one, skill.kinematics, skill.holds) for one in demonstrations]
     return max(
         float(skill.surprise(one.time, one.state.joints, one.frames).max()) for one in motions
