@@ -252,12 +252,12 @@ class Holding:
             Pose of the object when it was last free; its pose in the link now.
         """
         before = self.held.get(name, FREE)
-        old, apart = grasp if before.grasp is None else before.grasp, before.apart
+        apart = before.apart
         now = replace(
             before,
             carrier=torch.where(where, index, before.carrier),
-            grasp=choose(where, grasp, old),
-            taken=choose(where, place, place if before.taken is None else before.taken),
+            grasp=choose(where, grasp, before.grasp),
+            taken=choose(where, place, before.taken),
             given=where | before.given,
             apart=None if apart is None else choose(where, _constant(apart, math.inf), apart),
             joints=_restart_lag(before.joints, where),
@@ -380,7 +380,6 @@ class Holding:
         grasp, apart = before.grasp, before.apart
         for index in replace(before, carrier=carrier).carriers:
             other = now.seen_from(state.pose(self.kinematics.links[index]))
-            grasp = other if grasp is None else grasp
             apart = _constant(other, math.inf) if apart is None else apart
             news = (carrier == index) & (before.carrier != index)
             grasp = choose(news, other, grasp)
@@ -389,7 +388,7 @@ class Holding:
             before,
             carrier=carrier,
             grasp=grasp,
-            taken=now if before.taken is None else choose(held | ~holds, before.taken, now),
+            taken=choose(~held & holds, now, before.taken),
             given=given,
             apart=apart,
             joints=_restart_lag(before.joints, holds & ~held),
@@ -450,13 +449,12 @@ class Holding:
         assert held.grasp is not None and held.apart is not None
         grasp, apart, rests = held.grasp, held.apart, held.rests
         begins, first_link, first = apart.position.isnan().all(-1), held.link, held.first
-        shown = grasp if held.shown is None else choose(begins, grasp, held.shown)
+        shown = choose(begins, grasp, held.shown)
         for index in held.carriers:
             link, now = (s.pose(self.kinematics.links[index]) for s in (then, state))
             together, here = seen.seen_from(link), live & (held.carrier == index)
-            first_link = link if first_link is None else first_link
             first_link = choose(here & begins, link, first_link)
-            first = seen if first is None else choose(here & begins, seen, first)
+            first = choose(here & begins, seen, first)
             # it rests if it moved by less than half of the link's motion
             stirred = first_link.change(link, MOVED, TURNED)
             still = (stirred > 0.1) & (first.change(seen, MOVED, TURNED) < 0.5 * stirred)
@@ -472,7 +470,7 @@ class Holding:
         moving = held.moves_along
         if bool((moving | ~held.is_held).all()):
             return replace(held, first=None, last=None, rests=NO, shown=None)
-        last = seen if held.last is None else choose(live, seen, held.last)
+        last = choose(live, seen, held.last)
         return replace(held, first=first, last=last, rests=rests & ~moving, shown=shown)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
@@ -516,7 +514,7 @@ def _same(one: Frame, other: Frame) -> Tensor:
     return same & (one.orientation == other.orientation).all(-1)
 
 
-def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
+def choose(where: Tensor, one: Frame, other: Frame | None) -> Frame:
     """One pose for some robots, the other for the rest.
 
     Parameters
@@ -524,7 +522,10 @@ def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
     where : Tensor of bool, of shape () or (...)
         For which robots the first.
     one, other : Frame
+        There may be no other yet: then the first is for all.
     """
+    if other is None:
+        return one
     if not where.ndim:
         return one if bool(where) else other
     mask = where[..., None]

@@ -276,13 +276,10 @@ class SelectWays(DemonstrationEstimator):
         best = sorted(filter(None, splits), key=lambda split: split.worth)
         if self._given:
             return next(iter(best), None)
-        return next((one for one in best if not self._is_explained(one, views)), None)
+        found = (s for s in best if not self._is_shift(s) and not _is_situation(s, views))
+        return next(found, None)
 
-    def _is_explained(self, split: _Split, views: Sequence[_View]) -> bool:
-        """Check whether a shift in time explains a division, or what is seen at the start."""
-        return self._late(split) or _situational(split, views)
-
-    def _late(self, split: _Split) -> bool:
+    def _is_shift(self, split: _Split) -> bool:
         """Check whether modes differ by a shift in time: in a little while they meet."""
         values, labels = split.view.values, split.labels
         edges = _edges(values.shape[1])
@@ -385,7 +382,7 @@ def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
     return float(np.diff(np.sort(means)).min() / within)
 
 
-def _situational(split: _Split, views: Sequence[_View]) -> bool:
+def _is_situation(split: _Split, views: Sequence[_View]) -> bool:
     """Check whether beginnings, as some operator sees them, show the modes too."""
     one = np.zeros_like(split.labels)
     gains = [
