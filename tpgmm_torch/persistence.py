@@ -286,7 +286,7 @@ def _describe(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
 
 
 def _list_arguments(thing: Any) -> dict[str, Any]:
-    """List the arguments that make a thing again: all without an underscore before them."""
+    """List the arguments that make a thing again."""
     if isinstance(thing, TaskParameterizedGMM):
         skill, parameters = thing.skill, thing.get_params(deep=False)
         if not isinstance(parameters["random_state"], int):
@@ -301,7 +301,7 @@ def _list_arguments(thing: Any) -> dict[str, Any]:
             "summary": skill.summary,
         }  # fmt: skip
     if is_dataclass(thing):
-        names = [each.name for each in fields(thing) if not each.name.startswith("_")]
+        names = [each.name for each in fields(thing) if each.metadata.get("saved", True)]
         return {name: getattr(thing, name) for name in names}
     raise ModelFileError(
         f"{type(thing).__name__} cannot be saved: make an operator a frozen dataclass, give a "

@@ -29,6 +29,28 @@ MISSED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
+class Memory:
+    """What via-points know from tick to tick.
+
+    Parameters
+    ----------
+    clusters : tuple of Cluster
+        What is asked for, by times.
+    moved : tuple of Tensor of shape (..., A n_joints)
+        ``e_a`` of each cluster at the last tick; None where it did not count.
+    shift : Tensor of shape (..., n_joints), optional
+        ``e_t`` of the last tick; None where nothing was moved.
+    """
+
+    clusters: tuple[Cluster, ...] = ()
+    moved: tuple[Tensor | None, ...] = ()
+    shift: Tensor | None = None
+
+
+NOTHING = Memory()
+
+
+@dataclass(frozen=True, eq=False)
 class ViaPoints(CompositeSkill):
     """A skill conditioned on via-points; at other times it is the skill itself.
 
@@ -40,6 +62,8 @@ class ViaPoints(CompositeSkill):
         Between begin and end of the skill; text is for :meth:`ViaPoint.parse`.
     fade : float, default=1.0
         For how long before and after a via-point the skill is changed [s].
+    memory : Memory, optional
+        Of the last tick; made when it is left out.
 
     Raises
     ------
@@ -50,13 +74,10 @@ class ViaPoints(CompositeSkill):
     skill: Skill
     points: Sequence[Any]
     fade: float = 1.0
-    _clusters: tuple[Cluster, ...] = field(default=(), repr=False)
-    #: ``e_t`` of the last tick (..., n), and ``e_a`` of each cluster; None where nothing moved.
-    _shift: Tensor | None = field(default=None, repr=False)
-    _moved: tuple[Tensor | None, ...] = field(default=(), repr=False)
+    memory: Memory = field(default=NOTHING, repr=False, metadata={"saved": False})
 
     def __post_init__(self) -> None:
-        if self._clusters:  # of the last tick
+        if self.memory is not NOTHING:
             return
         points = [ViaPoint.parse(p) if isinstance(p, str) else p for p in self.points]
         for point in points:
@@ -67,8 +88,7 @@ class ViaPoints(CompositeSkill):
         for name, value in {
             "points": tuple(points),
             "fade": float(self.fade),
-            "_clusters": clusters,
-            "_moved": (None,) * len(clusters),
+            "memory": Memory(clusters, (None,) * len(clusters)),
         }.items():
             object.__setattr__(self, name, value)
 
@@ -103,35 +123,36 @@ class ViaPoints(CompositeSkill):
     ) -> Estimate:
         """Estimate the skill, given the via-points; see :meth:`Skill.estimate`."""
         joints, held = (state, None) if isinstance(state, Tensor) else (state.joints, state)
-        if self._shift is not None and self._shift.shape == joints.shape:
-            joints = joints - self._shift  # of other robots than those of the last tick: none
+        clusters, shift = self.memory.clusters, self.memory.shift
+        if shift is not None and shift.shape == joints.shape:
+            joints = joints - shift  # of other robots than those of the last tick: none
         around = Surroundings(self.skill, frames, held if held and held.carriers else None)
         free = around.estimate(time, joints, bounds)
         skill = self.skill.advance(free)
-        if not any(cluster.counts(time) for cluster in self._clusters):
-            after = replace(self, skill=skill, _shift=None, _moved=(None,) * len(self._moved))
-            return replace(free, after=after)
+        if not any(cluster.counts(time) for cluster in clusters):
+            memory = Memory(clusters, (None,) * len(clusters))
+            return replace(free, after=replace(self, skill=skill, memory=memory))
         if not bool(free.joints.isfinite().all()):  # of whom it cannot be told: as it was
-            kept = free.joints if self._shift is None else free.joints + self._shift
+            kept = free.joints if self.memory.shift is None else free.joints + self.memory.shift
             return replace(free, joints=kept, after=replace(self, skill=skill))
-        given, shift, moved = self._condition(time, free, around)
-        after = replace(self, skill=skill, _shift=shift, _moved=moved)
+        given, memory = self._condition(time, free, around)
+        after = replace(self, skill=skill, memory=memory)
         return replace(keep_within(given, bounds), after=after)
 
     def _condition(
         self, time: Tensor, free: Estimate, around: Surroundings
-    ) -> tuple[Estimate, Tensor, tuple[Tensor | None, ...]]:
-        """Condition an estimate on all clusters; also return ``e_t``, and ``e_a`` of each."""
+    ) -> tuple[Estimate, Memory]:
+        """Condition an estimate on all clusters."""
         here, moved = around.estimate(time, free.joints), list[Tensor | None]()
         shift, covariance = torch.zeros_like(here.joints), here.covariance
-        for cluster, last in zip(self._clusters, self._moved, strict=True):
+        for cluster, last in zip(self.memory.clusters, self.memory.moved, strict=True):
             there = None
             if cluster.counts(time):
                 more, narrowed, there = cluster.condition(time, here, around, last)
                 shift, covariance = shift + more, covariance - narrowed
             moved.append(there)
         given = replace(free, joints=here.joints + shift, covariance=covariance)
-        return given, shift, tuple(moved)
+        return given, Memory(self.memory.clusters, tuple(moved), shift)
 
     def candidates(
         self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
@@ -145,15 +166,15 @@ class ViaPoints(CompositeSkill):
 
     def of_robots(self, robots: Tensor) -> Self:
         """Keep some of the robots; see :meth:`Skill.of_robots`."""
-        some, shift = super().of_robots(robots), self._shift
+        some, shift = super().of_robots(robots), self.memory.shift
         if shift is None or shift.ndim == 1:
             return some
-        moved = tuple(None if one is None else one[robots] for one in self._moved)
-        return replace(some, _shift=shift[robots], _moved=moved)
+        moved = tuple(None if one is None else one[robots] for one in self.memory.moved)
+        return replace(some, memory=Memory(self.memory.clusters, moved, shift[robots]))
 
     def posture_search(self) -> PostureSearch | None:
         """Return the skill's search where no via-point counts, which it would undo."""
-        return None if self._shift is not None else self.skill.posture_search()
+        return None if self.memory.shift is not None else self.skill.posture_search()
 
     def report_misses(
         self, situations: Sequence[Situation], trajectories: Sequence[Trajectory]
