@@ -142,17 +142,17 @@ class Operator(ABC):
 
     @property
     def is_posture(self) -> bool:
-        """Whether its coordinates are joints themselves; not by default."""
+        """True if its coordinates are joints themselves; not by default."""
         return False
 
     @property
     def constrains_joints(self) -> bool:
-        """Whether it has rows in joint space; those of forces have none."""
+        """True if it has rows in joint space; those of forces have none."""
         return True
 
     @property
     def determines_joints(self) -> bool:
-        """Whether ``J`` has full column rank, so that this operator alone fixes every joint."""
+        """True if ``J`` has full column rank, so that this operator alone fixes every joint."""
         return False
 
     def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:

@@ -73,7 +73,7 @@ class Held:
 
     @property
     def is_held(self) -> Tensor:
-        """Whether a link holds it, of shape () or (...)."""
+        """True where a link holds it, of shape () or (...)."""
         return self.carrier >= 0
 
     @property
@@ -83,7 +83,7 @@ class Held:
 
     @property
     def moves_along(self) -> Tensor:
-        """Whether it was seen to move with its link (...)."""
+        """True where it was seen to move with its link (...)."""
         assert self.apart is not None
         return self.apart.position.isinf().all(-1)
 
@@ -165,7 +165,7 @@ class Holding:
 
     @property
     def carries(self) -> bool:
-        """Whether one of the objects may be held by some robot."""
+        """True if one of the objects may be held by some robot."""
         return any(
             name in self.held and self.held[name].grasp is not None for name in self.objects
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any, Self
@@ -48,6 +48,12 @@ class _View:
     def of(self, members: NDArray[np.intp]) -> _View:
         """Return the same of some of the demonstrations."""
         return replace(self, values=self.values[members])
+
+    def places(self) -> Iterator[tuple[_View, int, Array]]:
+        """List stretches, and coordinates (N,) of the demonstrations on each axis there."""
+        for stretch, means in enumerate(self.stretches.swapaxes(0, 1)):
+            for along in _axes(means):
+                yield self, stretch, along
 
     @property
     def stretches(self) -> Array:
@@ -265,12 +271,7 @@ class SelectWays(DemonstrationEstimator):
         most = min(self._given or self.max_ways, len(views[0].values) // FEWEST)
         if most < 2:
             return None
-        places = [
-            (view, stretch, along)
-            for view in views
-            for stretch, means in enumerate(view.stretches.swapaxes(0, 1))
-            for along in _axes(means)
-        ]
+        places = [place for view in views for place in view.places()]
         cost = math.log(max(len(places), 1))
         splits = [_divide_along(*place, cost, most, self._given) for place in places]
         best = sorted(filter(None, splits), key=lambda split: split.worth)
