@@ -10,8 +10,8 @@ Karcher mean, the rotation to which their squared angles add up to the least.
 
 The recordings are those of ``leave_one_out.py``, and so are the folds. Both models have the
 same settings and data and differ in the ``geometry`` of their orientation operators alone. The
-log-likelihood per time step counts orientations per volume of rotations
-(``tpgmm_torch.regression.rotation_density``), of time and of all operators' coordinates.
+log-likelihood per time step counts orientations per volume of rotations, of time and of all
+operators' coordinates.
 """
 
 import argparse
@@ -33,16 +33,20 @@ from tpgmm_torch import (
     Situation,
     Stack,
     TaskParameterizedGMM,
+    gaussians,
     quaternions,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.regression.rotation_density import rotation_log_density
+from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.training.mixture_settings import block_widths
 
 GEOMETRIES = ("quaternion", "tangent")
 TIME = torch.linspace(0, 3, 90, dtype=torch.float64)
+#: How much wider proposals are than what is integrated, as a factor of the covariance.
+WIDER = 1.2
 
 
 def with_geometry(operator: Operator, geometry: str) -> Operator:
@@ -98,11 +102,77 @@ def wide(seeds: int = 20) -> dict[float, np.ndarray]:
     }
 
 
+def rotation_log_density(
+    regression: Regression, time: Tensor, local: Sequence[Tensor], n_samples: int = 400
+) -> Tensor:
+    """Compute the log-density (T,) of time and local coordinates, per volume of rotations.
+
+    Quaternions have a density over four coordinates, rotation vectors one over three: they are
+    compared as densities of rotations, whose volume is that of small rotation vectors [rad^3],
+    ``8 pi^2`` in all. That of a rotation vector y is divided by ``det J_l(y)``. A Gaussian over
+    four coordinates is restricted to unit quaternions and normalised there,
+
+        p(x, eps | t) = sum_i h_i p_i(x, eps | t) / sum_i h_i Z_i,
+        Z_i = int p_i(eps | t) d eps   over one hemisphere about the mean,
+
+    by importance sampling in the tangent space of the mean's direction.
+    """
+    total = regression.log_density(time, local)
+    constant, four = time.new_zeros(()), False
+    for operator, one, x in zip(
+        regression.operators, regression.conditionals, local, strict=True
+    ):
+        for start in operator.rotation_vector_starts(regression.kinematics):
+            vector = x[:, start : start + 3]
+            total = total - torch.linalg.det(quaternions.left_jacobian(vector)).log()
+        starts = operator.quaternion_starts(regression.kinematics)
+        if starts and operator.links():
+            columns = torch.tensor([start + i for start in starts for i in range(4)])
+            constant = constant + _log_mass(one.marginal(columns), time, n_samples)
+            four = True
+    if not four:
+        return total
+    activation = torch.log_softmax(regression.marginals.log_activation(time[:, None]), -1)
+    return total - torch.logsumexp(activation + constant, -1)
+
+
+def _log_mass(one: Conditionals, time: Tensor, n_samples: int) -> Tensor:
+    """Compute log Z (T, K), the mass that Gaussians over quaternions leave to rotations."""
+    mean, covariance = one.at(time), one.covariance
+    count = mean.shape[-1] // 4
+    centre = torch.nn.functional.normalize(mean.unflatten(-1, (count, 4)), dim=-1)
+    basis = mean.new_zeros(*mean.shape, 3 * count)
+    for k in range(count):
+        turned = quaternions.left_matrix(centre[..., k, :])[..., 1:]
+        basis[..., 4 * k : 4 * k + 4, 3 * k : 3 * k + 3] = 0.5 * turned
+    factor = gaussians.cholesky(covariance, "the covariance of a component")
+    white = torch.linalg.solve_triangular(factor, basis, upper=False)
+    wide = gaussians.cholesky(WIDER * torch.linalg.inv(white.mT @ white), "a proposal")
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.randn(n_samples, 3 * count, generator=generator, dtype=torch.float64)
+    draws = draws.to(mean)
+    vectors = (wide.unsqueeze(-3) @ draws.unsqueeze(-1))[..., 0].unflatten(-1, (count, 3))
+    proposal = -0.5 * draws.square().sum(-1) - _log_normaliser(wide).unsqueeze(-1)
+    q = quaternions.product(centre.unsqueeze(-3), quaternions.exp(vectors)).flatten(-2)
+    residual = torch.linalg.solve_triangular(factor, (q - mean.unsqueeze(-2)).mT, upper=False)
+    density = -0.5 * residual.square().sum(-2) - _log_normaliser(factor).unsqueeze(-1)
+    volume = torch.linalg.det(quaternions.left_jacobian(vectors)).clamp(min=1e-300).log()
+    inside = (torch.linalg.vector_norm(vectors, dim=-1) < math.pi).all(-1)
+    terms = torch.where(inside, density + volume.sum(-1) - proposal, -torch.inf)
+    return terms.logsumexp(-1) - math.log(n_samples)
+
+
+def _log_normaliser(factor: Tensor) -> Tensor:
+    """Compute ``log sqrt(|2 pi L L^T|)``."""
+    diagonal = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return diagonal + 0.5 * factor.shape[-1] * math.log(2 * math.pi)
+
+
 def log_likelihood(model: TaskParameterizedGMM, shown: Demonstration) -> float:
     """Per time step, orientations per volume of rotations."""
-    [row] = model._rows([shown])
+    [row] = model.rows([shown])
     widths = block_widths(model.operators_, model.kinematics_)
-    blocks = torch.from_numpy(row).split(list(widths), 1)
+    blocks = row.split(list(widths), 1)
     local = [block[:, 1:] for block in blocks]
     return float(rotation_log_density(model.skill, blocks[0][:, 0], local).mean())
 

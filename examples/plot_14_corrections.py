@@ -9,6 +9,7 @@ again, with the demonstrations.
 
 # sphinx_gallery_thumbnail_number = 1
 import warnings
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,7 +18,6 @@ from sklearn.base import clone
 from tpgmm_control import rollout
 from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoints
-from tpgmm_torch.corrections import in_skill_time
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.skills.via_point import ViaPoint
 
@@ -53,13 +53,29 @@ skill = ViaPoints(model.skill, [ViaPoint(2.0, "canonical", [0.5])])
 # ------------
 # Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in
 # the skill that belongs is found, and the model is learned again, without the two oldest
-# demonstrations.
+# demonstrations. It begins where the reproduction is like its beginning, and ends where that
+# is like its end; of places that explain both, those count at which it is about as fast.
+
+
+def in_skill_time(reproduction, shown, max_slope=4.0):
+    """Bring a demonstration of the whole skill, or of a part of it, into the skill's time."""
+    instants, path = reproduction.time.numpy(), reproduction.joints.numpy()
+    begin, end = (((path - q) ** 2).mean(1) / 0.1**2 for q in shown.joints[[0, -1]].numpy())
+    lasts = instants[None, :] - instants[:, None]
+    # 0.1 rad off cost as much as twice or half the pace
+    octaves = np.log2(np.maximum(lasts, 1e-9) / shown.duration)
+    cost = begin[:, None] + end[None, :] + octaves**2
+    cost[abs(octaves) > np.log2(max_slope)] = np.inf
+    first, last = np.unravel_index(cost.argmin(), cost.shape)
+    scale = lasts[first, last] / shown.duration
+    return replace(shown, time=instants[first] + scale * (shown.time - shown.time[0]))
+
 
 part = np.linspace(2.5, 3.5, 80)
 lower = np.sin(1.5 * part) - 0.4 * np.sin(np.pi * (part - 2.5)) ** 2
 shown = Demonstration(1.2 * (part - 2.5), lower[:, None])
 again = Demonstration(0.9 * (part - 2.5), lower[:, None] + 0.02)
-placed = in_skill_time(model, [shown, again])
+placed = [in_skill_time(before, one) for one in (shown, again)]
 warnings.simplefilter("ignore", PlausibilityWarning)  # segments are shorter than the others
 corrected = clone(model).fit([*demonstrations[2:], *placed])
 [after] = corrected.predict([situation])

@@ -7,36 +7,30 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.data.demonstrations import Demonstration, Situation
-    from tpgmm_torch.data.frames import Frame
-    from tpgmm_torch.data.holds import Hold
-    from tpgmm_torch.data.trajectories import Trajectory
-    from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.operators import (
-        AbsoluteOrientation,
-        AbsolutePosition,
-        Canonical,
-        RelativeOrientation,
-        RelativePosition,
-        Stack,
-    )
-    from tpgmm_torch.persistence import load, save
-    from tpgmm_torch.robots.robot import Robot
-    from tpgmm_torch.skills.sequence import Sequence
-    from tpgmm_torch.skills.via_points import ViaPoints
-    from tpgmm_torch.skills.ways import Ways
-    from tpgmm_torch.structure.select_components import SelectComponents
-    from tpgmm_torch.structure.select_operators import SelectOperators
-    from tpgmm_torch.training.hold_detection import attach_holds, find_holds
+    from tpgmm_torch.data.demonstrations import Demonstration as Demonstration
+    from tpgmm_torch.data.demonstrations import Situation as Situation
+    from tpgmm_torch.data.frames import Frame as Frame
+    from tpgmm_torch.data.holds import Hold as Hold
+    from tpgmm_torch.data.trajectories import Trajectory as Trajectory
+    from tpgmm_torch.estimator import TaskParameterizedGMM as TaskParameterizedGMM
+    from tpgmm_torch.operators import AbsoluteOrientation as AbsoluteOrientation
+    from tpgmm_torch.operators import AbsolutePosition as AbsolutePosition
+    from tpgmm_torch.operators import Canonical as Canonical
+    from tpgmm_torch.operators import RelativeOrientation as RelativeOrientation
+    from tpgmm_torch.operators import RelativePosition as RelativePosition
+    from tpgmm_torch.operators import Stack as Stack
+    from tpgmm_torch.persistence import load as load
+    from tpgmm_torch.persistence import save as save
+    from tpgmm_torch.robots.robot import Robot as Robot
+    from tpgmm_torch.skills.sequence import Sequence as Sequence
+    from tpgmm_torch.skills.via_points import ViaPoints as ViaPoints
+    from tpgmm_torch.skills.ways import Ways as Ways
+    from tpgmm_torch.structure.select_components import SelectComponents as SelectComponents
+    from tpgmm_torch.structure.select_operators import SelectOperators as SelectOperators
+    from tpgmm_torch.training.hold_detection import attach_holds as attach_holds
+    from tpgmm_torch.training.hold_detection import find_holds as find_holds
 
     __version__: str
-
-__all__ = [
-    "AbsoluteOrientation", "AbsolutePosition", "Canonical", "Demonstration", "Frame",
-    "Hold", "RelativeOrientation", "RelativePosition", "Robot", "SelectComponents",
-    "SelectOperators", "Sequence", "Situation", "Stack", "TaskParameterizedGMM",
-    "Trajectory", "ViaPoints", "Ways", "attach_holds", "find_holds", "load", "save",
-]  # fmt: skip
 
 _HOMES = {
     "data.demonstrations": ("Demonstration", "Situation"),
@@ -44,8 +38,12 @@ _HOMES = {
     "data.frames": ("Frame",),
     "data.holds": ("Hold",),
     "operators": (
-        "AbsoluteOrientation", "AbsolutePosition", "Canonical", "RelativeOrientation",
-        "RelativePosition", "Stack",
+        "AbsoluteOrientation",
+        "AbsolutePosition",
+        "Canonical",
+        "RelativeOrientation",
+        "RelativePosition",
+        "Stack",
     ),
     "persistence": ("load", "save"),
     "robots.robot": ("Robot",),
@@ -56,8 +54,9 @@ _HOMES = {
     "structure.select_operators": ("SelectOperators",),
     "data.trajectories": ("Trajectory",),
     "training.hold_detection": ("attach_holds", "find_holds"),
-}  # fmt: skip
+}
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:

@@ -362,7 +362,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         list of Tensor of shape (T_m, sum_j (1 + D_j))
             ``mixture_.bic``, ``mixture_.predict`` and the like take them.
         """
-        expected, demonstrations = self.skill.expected, check_demonstrations(X)
+        expected, demonstrations = self.skill.expect, check_demonstrations(X)
         for operator in self.operators_:
             operator.check(self.kinematics_, demonstrations[0].frames)
         known = self.operators_, self.kinematics_, expected, self.holds_
@@ -388,7 +388,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         summary: TrainingSummary | None = None,
         **settings: Any,
     ) -> Self:
-        """A fitted model of known parameters, which are kept as they are.
+        """Return a fitted model of known parameters, which are kept as they are.
 
         Parameters
         ----------

@@ -9,7 +9,6 @@ not fit together.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import math
 from collections import abc
@@ -48,7 +47,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "validated"]
+__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "validate"]
 
 #: Files of a model.
 FILES = CONFIG, TENSORS = "config.json", "model.safetensors"
@@ -105,7 +104,7 @@ def save(model: Any, path: str | Path) -> None:
 
 
 def _replaceable(path: Path) -> bool:
-    """Whether nothing but a model, or nothing at all, is lost by replacing what is there."""
+    """Check that nothing but a model, or nothing at all, is lost by replacing what is there."""
     if not path.is_dir() or contents(path) - set(FILES):
         return False
     try:
@@ -117,7 +116,7 @@ def _replaceable(path: Path) -> bool:
 
 
 def _digest(config: Mapping[str, Any]) -> str:
-    """Of a configuration without its own digest; empty if it is not of JSON's values."""
+    """Compute the digest of a configuration; empty if that is not of JSON's values."""
     body = {key: value for key, value in config.items() if key != "digest"}
     try:
         text = json.dumps(body, sort_keys=True, allow_nan=False)
@@ -156,12 +155,12 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
             f"{path} cannot be loaded onto the device {device!r}: "
             f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
         ) from error
-    return validated(decode(config.get("model"), custom, on_device))
+    return validate(decode(config.get("model"), custom, on_device))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Configuration and tensors of a folder, of which nothing was cut off or changed."""
-    config = _parsed(path / CONFIG, json.loads)
+    """Read configuration and tensors of a folder; refuse what was cut off or changed."""
+    config = _parse(path / CONFIG, json.loads)
     if not isinstance(config, dict) or config.get("format") != FORMAT["format"]:
         kind = config.get("type") if isinstance(config, dict) else None
         if kind == "tpgmm":  # a TPGMMPolicy
@@ -175,13 +174,13 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if config.get("digest") != (_digest(config) or None):
         raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
-    blob = _parsed(path / TENSORS, bytes)
+    blob = _parse(path / TENSORS, bytes)
     if config.get("tensors_sha256") != hashlib.sha256(blob).hexdigest():
         raise ModelFileError(f"{path / TENSORS} was cut off or changed after it was saved")
-    return config, _parsed(path / TENSORS, safetensors.torch.load)
+    return config, _parse(path / TENSORS, safetensors.torch.load)
 
 
-def _parsed[T](file: Path, parse: Callable[[bytes], T]) -> T:
+def _parse[T](file: Path, parse: Callable[[bytes], T]) -> T:
     try:
         return parse(read_whole(file))
     except (FileNotFoundError, NotADirectoryError):
@@ -261,11 +260,11 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
         name = f"{len(tensors):04d}"
         tensors[name] = thing
         return {"tensor": name}
-    return _described(thing, tensors)
+    return _describe(thing, tensors)
 
 
-def _described(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
-    """An object as the name of its class and its fields."""
+def _describe(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
+    """Describe an object by the name of its class and its fields."""
     if isinstance(thing, FunctionType | MethodType):
         raise ModelFileError(
             f"the Python function {thing.__name__!r} cannot be saved, no file brings code: use "
@@ -281,36 +280,28 @@ def _described(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
         if not _digest(given):
             raise ModelFileError(f"config() of {name} gives more than JSON's values: {given}")
         return {"type": name} | given
-    return {"type": name} | {key: encode(each, tensors) for key, each in _parts(thing).items()}
+    arguments = _list_arguments(thing).items()
+    return {"type": name} | {key: encode(each, tensors) for key, each in arguments}
 
 
-def _parts(thing: Any) -> dict[str, Any]:
-    """Arguments from which a thing can be made again."""
+def _list_arguments(thing: Any) -> dict[str, Any]:
+    """List the arguments that make a thing again."""
     if isinstance(thing, TaskParameterizedGMM):
         skill, parameters = thing.skill, thing.get_params(deep=False)
         if not isinstance(parameters["random_state"], int):
             parameters["random_state"] = None
         learned = {name: getattr(thing, f"{name}_") for name in LEARNED}
-        return (
-            parameters
-            | learned
-            | {
-                "n_components": len(thing.weights_),
-                "operators": thing.operators_,
-                "robot": thing.kinematics_,
-                "learning": {name: getattr(thing, name) for name in LEARNING},
-                "peaks": skill.peaks,
-                "summary": skill.summary,
-            }
-        )
-    if isinstance(thing, ViaPoint):
-        value = thing.value
-        named = dict(value) if isinstance(value[0], tuple) else value  # type: ignore[arg-type]
-        return vars(thing) | {"value": named}
-    if isinstance(thing, ViaPoints):
-        return {"skill": thing.skill, "points": thing.points, "fade": thing.fade}
+        return parameters | learned | {
+            "n_components": len(thing.weights_),
+            "operators": thing.operators_,
+            "robot": thing.kinematics_,
+            "learning": {name: getattr(thing, name) for name in LEARNING},
+            "peaks": skill.peaks,
+            "summary": skill.summary,
+        }  # fmt: skip
     if is_dataclass(thing):
-        return {each.name: getattr(thing, each.name) for each in fields(thing)}
+        names = [each.name for each in fields(thing) if each.metadata.get("saved", True)]
+        return {name: getattr(thing, name) for name in names}
     raise ModelFileError(
         f"{type(thing).__name__} cannot be saved: make an operator a frozen dataclass, give a "
         "robot config() and a classmethod from_config()"
@@ -322,7 +313,7 @@ def decode(
     custom: abc.Sequence[type] = (),
     tensors: Mapping[str, Tensor] | None = None,
 ) -> Any:
-    """The inverse of :func:`encode`.
+    """Make a model or a part of it again, the inverse of :func:`encode`.
 
     Parameters
     ----------
@@ -338,15 +329,15 @@ def decode(
     ModelFileError
         If a class is not known or does not take these fields.
     """
-    return _decoded(description, "model", custom, tensors or {})
+    return _decode(description, "model", custom, tensors or {})
 
 
-def _decoded(
+def _decode(
     description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
     """Decode an entry; errors name it."""
     try:
-        return _entry(description, entry, custom, tensors)
+        return _read_entry(description, entry, custom, tensors)
     except ModelFileError:
         raise
     except Exception as error:  # of classes and shapes that do not go together, of any kind
@@ -354,14 +345,12 @@ def _decoded(
         raise ModelFileError(f"the entry {entry!r} does not fit together: {said}") from error
 
 
-def _entry(
+def _read_entry(
     description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
 ) -> Any:
-    def inner(name: object, each: Any) -> Any:
-        return _decoded(each, f"{entry}.{name}", custom, tensors)
-
     if isinstance(description, list):
-        return tuple(itertools.starmap(inner, enumerate(description)))
+        pairs = enumerate(description)
+        return tuple(_decode(one, f"{entry}.{k}", custom, tensors) for k, one in pairs)
     if not isinstance(description, Mapping):
         return description
     if "float" in description:
@@ -369,14 +358,14 @@ def _entry(
     if "tensor" in description:
         return tensors[description["tensor"]]
     if "config" in description:  # of a class, which reads it itself
-        return _rebuilt(dict(description), custom)
-    fields = description.get("mapping", description)
-    given = {key: inner(key, each) for key, each in fields.items()}
-    return given if "mapping" in description else _rebuilt(given, custom)
+        return _rebuild(dict(description), custom)
+    fields = description.get("mapping", description).items()
+    given = {key: _decode(one, f"{entry}.{key}", custom, tensors) for key, one in fields}
+    return given if "mapping" in description else _rebuild(given, custom)
 
 
-def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
-    """An object of its class's name and its fields."""
+def _rebuild(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
+    """Make an object again from its class's name and its fields."""
     known = KNOWN | {kind.__name__: kind for kind in custom}
     name = given.pop("type", None)
     if name not in known:
@@ -417,7 +406,7 @@ def _check_fields(made: Any, given: Mapping[str, Any]) -> None:
 
 
 def _fits(value: Any, wanted: Any) -> bool:
-    """Whether a value is of an annotated type."""
+    """Check that a value is of an annotated type."""
     origin, inner = get_origin(wanted) or wanted, get_args(wanted)
     if origin in (Union, UnionType):
         return any(_fits(value, each) for each in inner)
@@ -431,7 +420,7 @@ def _fits(value: Any, wanted: Any) -> bool:
 
 
 def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
-    """Names, values and wanted shapes of what a mixture computes with."""
+    """List names, values and wanted shapes of what a mixture computes with."""
     robot, count = skill.kinematics, len(skill.log_weights)
     yield "log_weights", skill.log_weights, (count,)
     yield "time", skill.time, (max(len(skill.time), 2),)
@@ -448,7 +437,7 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
         yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
 
 
-def validated(model: Any) -> Any:
+def validate(model: Any) -> Any:
     """Validate a model or a skill by running it once; returns it.
 
     Parameters

@@ -51,7 +51,7 @@ from tpgmm_torch.hub import describe, download, model_card, upload
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.persistence import decode, encode, validated
+from tpgmm_torch.persistence import decode, encode, validate
 from tpgmm_torch.robots import Kinematics, Robot
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
@@ -736,7 +736,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             if learned := json.loads(read_whole(folder / CONFIG_NAME)).get("cell"):
                 config.cell = take_over(config.cell, learned)
             policy = cls(config, model=model, **options).eval().to(config.device)
-            validated(policy.skill)  # with the settings of the configuration
+            validate(policy.skill)  # with the settings of the configuration
         except TPGMMError:
             raise
         except Exception as error:  # of LeRobot, its parser and torch

@@ -48,7 +48,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("regression",),
         ("events", "skills"),
         ("estimator",),
-        ("corrections", "persistence", "structure"),
+        ("persistence", "structure"),
         ("hub",),
     ),
     "tpgmm_control": (

@@ -693,7 +693,7 @@ def test_a_score_is_the_mean_over_all_time_steps():
 
 def test_time_counts_once_however_many_operators_there_are():
     model, [shown] = hands_model(covariance_shrinkage=0).fit(handlings()), handlings(1)
-    rows = local_data([shown], model.operators_, HANDS, model.skill.expected)[0].numpy()
+    rows = local_data([shown], model.operators_, HANDS, model.skill.expect)[0].numpy()
     sides, component = np.split(rows, 2, axis=1), []
     for k in range(len(model.weights_)):
         logs = [np.log(float(model.weights_[k]))]

@@ -299,7 +299,7 @@ def plot_local(
         shown.append((motion, {**look, **style}))
 
     def estimate(_operator: int, time: Tensor) -> Tensor:
-        return model.skill.expected(operator, time)
+        return model.skill.expect(operator, time)
 
     motions = [motion for motion, _ in shown]
     rows = local_data(motions, [chosen], model.kinematics_, estimate, model.holds_)

@@ -16,8 +16,7 @@ from tpgmm_torch.data.frames import LEVER, STILL, Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.base import carried_objects, frame_names
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import carried_objects, frame_names, leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 

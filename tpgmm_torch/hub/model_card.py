@@ -49,7 +49,7 @@ def model_card(
     use: str = USE,
     library: str = "tpgmm-torch",
 ) -> str:
-    """The README.md of a repository that holds a model.
+    """Return the README.md of a repository that holds a model.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def model_card(
 
 
 def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
-    """The sections of a card that follow from the model itself, as Markdown.
+    """Return the sections of a card that follow from the model itself, as Markdown.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def sections(model: Any, measured: Mapping[str, object] | None = None) -> dict[s
 
 
 def _parts(skill: Any, name: str = "") -> Iterator[tuple[str, Regression]]:
-    """The fitted mixtures of a skill, by the name that each has among them."""
+    """Return the fitted mixtures of a skill, by the name that each has among them."""
     if isinstance(skill, Regression):
         yield name, skill
     elif isinstance(skill, ViaPoints):
@@ -173,7 +173,7 @@ def _influence(skill: Regression) -> str:
 
 
 def _middle(skill: Regression) -> Situation | None:
-    """The situation amid those shown; None where they are not known."""
+    """Return the situation amid those shown; None where they are not known."""
     shown = skill.summary
     if shown is None or not set(skill.frame_names) <= shown.frames.keys():
         return None

@@ -149,7 +149,7 @@ def download(
     revision: str | None = None,
     token: str | None = None,
 ) -> Path:
-    """A folder with some files of a repository; one that is there already is only returned.
+    """Fetch some files of a repository into a folder; return one that is there already.
 
     Parameters
     ----------

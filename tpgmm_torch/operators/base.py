@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "of_joints"]
+__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "leaves", "of_joints"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Linearization:
         return jacobian, matrix
 
     def without(self, rigid: Tensor) -> Linearization:
-        """The rows as ``0 = 0``, where the joints cannot change what the operator measures.
+        """Make rows ``0 = 0`` where the joints cannot change what the operator measures.
 
         Parameters
         ----------
@@ -80,22 +80,22 @@ class Operator(ABC):
 
     @abstractmethod
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """D, the number of local coordinates."""
+        """Count the local coordinates, D."""
 
     @abstractmethod
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """``J``, ``M``, ``c`` at the state q_{t-1}; frames of shapes that broadcast with it."""
+        """Compute ``J``, ``M``, ``c`` at the state q_{t-1}; frames broadcast with it."""
 
     @abstractmethod
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """The local coordinates X_t of a state, shape (..., D)."""
+        """Compute the local coordinates X_t of a state, shape (..., D)."""
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
-        """Where unit quaternions begin among the local coordinates; none by default."""
+        """List where unit quaternions begin among the local coordinates; none by default."""
         return ()
 
     def rotation_vector_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
-        """Where rotation vectors [rad] begin among the coordinates; none by default."""
+        """List where rotation vectors [rad] begin among the coordinates; none by default."""
         return ()
 
     def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
@@ -106,7 +106,7 @@ class Operator(ABC):
         return (0.0,) * self.dimension(kinematics)
 
     def at(self, time: Tensor) -> Operator:
-        """The operator at ``time`` (...) [s]: itself, unless its coordinates follow a path."""
+        """Bind it to ``time`` (...) [s]: itself, unless its coordinates follow a path."""
         return self
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
@@ -117,7 +117,7 @@ class Operator(ABC):
         return (0.0,) * self.dimension(kinematics)
 
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
-        """The unit of each coordinate; None, the default, if it is like no other.
+        """Return the unit of each coordinate; None, the default, if it is like no other.
 
         Variances of one unit are learned together from few demonstrations.
         """
@@ -132,13 +132,27 @@ class Operator(ABC):
         return ()
 
     @property
+    def leaves(self) -> tuple[Operator, ...]:
+        """The operator itself; of a stack, its members."""
+        return (self,)
+
+    def text(self) -> str | None:
+        """Write it as a term of :mod:`tpgmm_torch.operators.text`; by default there is none."""
+        return None
+
+    @property
+    def is_posture(self) -> bool:
+        """True if its coordinates are joints themselves; not by default."""
+        return False
+
+    @property
     def constrains_joints(self) -> bool:
-        """Whether it has rows in joint space; those of forces have none."""
+        """True if it has rows in joint space; those of forces have none."""
         return True
 
     @property
     def determines_joints(self) -> bool:
-        """Whether ``J`` has full column rank, so that this operator alone fixes every joint."""
+        """True if ``J`` has full column rank, so that this operator alone fixes every joint."""
         return False
 
     def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
@@ -210,12 +224,17 @@ class Operator(ABC):
 
 
 def of_joints(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """Those ``operators`` that have rows in joint space: the first ones."""
+    """Select the ``operators`` that have rows in joint space: the first ones."""
     return tuple(operator for operator in operators if operator.constrains_joints)
 
 
+def leaves(operators: Iterable[Operator]) -> tuple[Operator, ...]:
+    """List the members of stacks, and other operators, of some ``operators`` in their order."""
+    return tuple(leaf for operator in operators for leaf in operator.leaves)
+
+
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
-    """Names of the frames that a situation must have, each once.
+    """List the frames that a situation must have, each once.
 
     Parameters
     ----------
@@ -229,7 +248,7 @@ def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[
 
 
 def carried_objects(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
-    """Names of the objects that operators refer to as things that the robot may carry.
+    """List the objects that operators refer to as things that the robot may carry.
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ class Canonical(Operator):
         object.__setattr__(self, "joints", listed)
 
     def columns(self, joint_names: Sequence[str]) -> tuple[int, ...]:
-        """Where its joints stand in the joint vector.
+        """List the indices of its joints in the joint vector.
 
         Parameters
         ----------
@@ -83,7 +83,7 @@ class Canonical(Operator):
         return _columns(self.joints, tuple(joint_names))
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance, for every joint; half of it for what is part of a quaternion."""
+        """Return the tolerance of every joint; half of it for parts of a quaternion."""
         tolerances = [self.tolerance] * self.dimension(kinematics)
         for start in self.quaternion_starts(kinematics):
             tolerances[start : start + 4] = [self.tolerance / 2] * 4
@@ -97,7 +97,7 @@ class Canonical(Operator):
         return tuple(map(known.get, self.columns(kinematics.joint_names)))
 
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """The number of joints."""
+        """Return the number of joints."""
         if kinematics is None:
             raise DataError("Canonical() has as many coordinates as the robot has joints")
         return len(self.columns(kinematics.joint_names))
@@ -142,6 +142,10 @@ class Canonical(Operator):
                 starts.append(columns.index(start))
         return tuple(starts)
 
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        return "canonical" if self.joints is None else f"canonical:{','.join(self.joints)}"
+
     def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that its joints exist, and that no quaternion is cut.
 
@@ -151,6 +155,11 @@ class Canonical(Operator):
             If they do not, or one is.
         """
         self.quaternion_starts(kinematics)
+
+    @property
+    def is_posture(self) -> bool:
+        """Yes."""
+        return True
 
     @property
     def determines_joints(self) -> bool:

@@ -75,7 +75,7 @@ class _Orientation(PoseOperator):
         return 3 if self._tangent else 4
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance; of a quaternion half of it, which a turn moves by half its angle."""
+        """Return the tolerance; half of it for a quaternion, which turns by half the angle."""
         return (self.tolerance,) * 3 if self._tangent else (self.tolerance / 2,) * 4
 
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
@@ -142,7 +142,7 @@ class _Orientation(PoseOperator):
         return quaternions.log(seen) if self._tangent else seen
 
     def is_bilinear(self, state: RobotState) -> bool:
-        """Whether :func:`linearize_poses` serves: not in tangent space, nor for tracked poses.
+        """Check that :func:`linearize_poses` serves: not in tangent space nor tracked poses.
 
         Where a link's quaternion is part of the joint vector nothing has to be linearised.
         """

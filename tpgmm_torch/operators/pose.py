@@ -52,12 +52,19 @@ class PoseOperator(Operator):
         return getattr(self, "frame", None)
 
     def links(self) -> tuple[str, ...]:
-        """The link; the frame too, if it is the held object that is meant."""
+        """Return the link; the frame too, if it is the held object that is meant."""
         return (self.link, self._frame) if self._frame and self.held else (self.link,)
 
     def references(self) -> tuple[str, ...]:
-        """The frame, if it is a place."""
+        """Return the frame, if it is a place."""
         return (self._frame,) if self._frame and not self.held else ()
+
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        kind = "position" if self.gain is None else "orientation"
+        tangent = "[tangent]" if self.rotation_vector_starts(None) else ""
+        frame = f"@{'held:' * self.held}{self._frame}" if self._frame else ""
+        return f"{kind}{tangent}:{self.link}{frame}"
 
     @cached_property
     def term(self) -> _Term:
@@ -65,16 +72,16 @@ class PoseOperator(Operator):
         return _Term(self.link, self._frame, self.held, self.gain)
 
     def moving_reference(self, state: RobotState) -> str | None:
-        """The link or carried object that coordinates are seen from; None if it is a place."""
+        """Return the link or held object that it is seen from; None if that is a place."""
         moving = state.links if self.held else state.robot_links
         return self._frame if self._frame in moving else None
 
     def is_bilinear(self, state: RobotState) -> bool:
-        """Whether :func:`linearize_poses` serves."""
+        """Check that :func:`linearize_poses` serves."""
         return True
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """The row of eq. (6) for a position, of eq. (11) for an orientation.
+        """Return the row of eq. (6) for a position, of eq. (11) for an orientation.
 
         ``J (q - q_{t-1}) = R mu + p - x_{t-1}``, and
         ``J (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``.
@@ -87,7 +94,7 @@ class PoseOperator(Operator):
     def poses(
         self, state: RobotState, frames: Mapping[str, Frame]
     ) -> tuple[Frame, Frame | None]:
-        """Of what is seen, and of what it is seen from; None is the base frame."""
+        """Return the poses of what is seen and of what it is seen from, None for the base."""
         body = (
             state.pose(self.link)
             if self.link in state.links
@@ -236,12 +243,12 @@ def _all_poses(
     positions = state.positions, *(place.position.unsqueeze(-2) for place in places)
     orientations = state.orientations, *(place.orientation.unsqueeze(-2) for place in places)
 
-    def joined(parts: Sequence[Tensor]) -> Tensor:
+    def join(parts: Sequence[Tensor]) -> Tensor:
         shapes = [(*batch, *part.shape[-2:]) for part in parts]
         both = zip(parts, shapes, strict=True)
         return torch.cat([p if p.shape == shape else p.expand(shape) for p, shape in both], -2)
 
-    return joined(positions), joined(orientations)
+    return join(positions), join(orientations)
 
 
 def _product(row: Tensor, matrix: Tensor) -> Tensor:

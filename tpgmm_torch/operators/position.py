@@ -20,7 +20,7 @@ class _Position(PoseOperator):
         return 3
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance, along each axis."""
+        """Return the tolerance, along each axis."""
         return (self.tolerance,) * 3
 
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:

@@ -14,15 +14,17 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators.base import Linearization, Operator
+from tpgmm_torch.operators.base import Linearization, Operator, leaves
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.pose import linearize_poses
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["POSE_OPERATORS", "Stack", "leaves"]
+__all__ = ["POSE_OPERATORS", "Stack"]
 
-#: Operators that are linearised together.
+#: Operators that are linearised together. Their M has full row rank at every state, so that
+#: ``M Sigma M^T`` is as definite as what was learned; one of another kind may claim to know a
+#: direction exactly by mistake, which only the sum of precisions refuses.
 POSE_OPERATORS = AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation
 
 
@@ -68,7 +70,7 @@ class Stack(Operator):
         return leaves(self.operators)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """The sum of the dimensions."""
+        """Return the sum of the dimensions."""
         return sum(operator.dimension(kinematics) for operator in self.operators)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
@@ -79,12 +81,12 @@ class Stack(Operator):
                 parts.append(linearize_poses(tuple(group), state, frames))  # type: ignore[arg-type]
             else:
                 parts += [operator.linearize(state, frames) for operator in group]
-        return parts[0] if len(parts) == 1 else _stacked(parts, state.joints)
+        return parts[0] if len(parts) == 1 else _stack_rows(parts, state.joints)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """The coordinates side by side."""
+        """Return the coordinates side by side."""
         parts = [operator.coordinates(state, frames) for operator in self.operators]
-        return _joined(parts, gaussians.common_shape(*(part.shape[:-1] for part in parts)), 1)
+        return _join(parts, gaussians.common_shape(*(part.shape[:-1] for part in parts)), 1)
 
     def _starts(self, method: str, kinematics: Kinematics | None) -> tuple[int, ...]:
         starts: list[int] = []
@@ -107,7 +109,7 @@ class Stack(Operator):
         return tuple(v for o in self.operators for v in o.path_variances(kinematics))
 
     def at(self, time: Tensor) -> Operator:
-        """The stack of the members at a time."""
+        """Return the stack of the members at a time."""
         members = [operator.at(time) for operator in self.operators]
         return self if all(map(is_, members, self.operators)) else Stack(*members)
 
@@ -136,21 +138,12 @@ class Stack(Operator):
         return f"Stack({', '.join(map(repr, self.operators))})"
 
 
-def leaves(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """The members of stacks, and other operators, of some ``operators`` in their order."""
-    return tuple(
-        leaf
-        for operator in operators
-        for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
-    )
-
-
 def _is_bilinear(operator: Operator, state: RobotState) -> bool:
     # a class that is derived from one of them may linearise in its own way
     return type(operator) in POSE_OPERATORS and operator.is_bilinear(state)  # type: ignore[attr-defined]
 
 
-def _stacked(parts: Sequence[Linearization], like: Tensor) -> Linearization:
+def _stack_rows(parts: Sequence[Linearization], like: Tensor) -> Linearization:
     """Parts below one another: matrices on the diagonal of one."""
     jacobians, matrices = zip(*(part.dense() for part in parts), strict=True)
     rows = [part.displacement for part in parts]
@@ -158,10 +151,10 @@ def _stacked(parts: Sequence[Linearization], like: Tensor) -> Linearization:
     batch = gaussians.common_shape(like.shape[:-1], *tails, *(row.shape[:-1] for row in rows))
     present = [part.present for part in parts if part.present is not None]
     return Linearization(
-        _joined(jacobians, batch, 2),
+        _join(jacobians, batch, 2),
         gaussians.block_diagonal(matrices, batch),
-        _joined(rows, batch, 1),
-        _joined(present, batch, 1) if len(present) == len(parts) else None,
+        _join(rows, batch, 1),
+        _join(present, batch, 1) if len(present) == len(parts) else None,
         _noise(parts, batch),
     )
 
@@ -171,9 +164,9 @@ def _noise(parts: Sequence[Linearization], batch: torch.Size) -> Tensor | None:
         return None
     zeros = torch.zeros_like
     noise = [zeros(p.displacement) if p.noise is None else p.noise for p in parts]
-    return _joined(noise, batch, 1)
+    return _join(noise, batch, 1)
 
 
-def _joined(parts: Sequence[Tensor], batch: torch.Size, rank: int) -> Tensor:
+def _join(parts: Sequence[Tensor], batch: torch.Size, rank: int) -> Tensor:
     """Parts one after the other along the first dimension behind the batch."""
     return torch.cat([part.expand(*batch, *part.shape[-rank:]) for part in parts], dim=-rank)

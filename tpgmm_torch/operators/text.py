@@ -33,6 +33,8 @@ TERM = re.compile(
     r":(?P<link>[^\s:@+~]+)(@(?P<held>held:)?(?P<frame>[^\s:@+~]+))?)"
     r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
 )
+#: Classes of which the grammar has terms.
+TERMS = (Canonical, Wrench, *POSE_OPERATORS)
 #: What ``pose`` is short for.
 PAIR = re.compile(r"position:([^\s~]+) \+ orientation(\[tangent\])?:\1(?= |$)")
 GRAMMAR = (
@@ -47,7 +49,7 @@ GRAMMAR = (
 
 
 def parse_operator(text: str) -> Operator:
-    """The operator that a text stands for; a :class:`Stack` if there are several.
+    """Read an operator from text; a :class:`Stack` if there are several.
 
     Parameters
     ----------
@@ -100,13 +102,13 @@ def _poses(match: re.Match[str], options: dict[str, Any], text: str) -> list[Ope
         position, orientation = RelativePosition, RelativeOrientation
         place, options["held"] = [*place, frame], bool(match["held"])
     geometry = match["geometry"] or "quaternion"
-    one, other = position(*place, **options), orientation(*place, **options, geometry=geometry)
-    kind = match["kind"].split("[")[0]
-    return {"position": [one], "orientation": [other], "pose": [one, other]}[kind]
+    pose = [position(*place, **options), orientation(*place, **options, geometry=geometry)]
+    chosen = {"position": slice(0, 1), "orientation": slice(1, 2), "pose": slice(0, 2)}
+    return pose[chosen[match["kind"].split("[")[0]]]
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
-    """All ``links`` seen from all ``frames`` (or from the base) as one stack; the joints."""
+    """Stack all ``links`` seen from all ``frames`` (or from the base), and add the joints."""
     references = [f"@{name}" for name in frames] or [""]
     poses = [f"pose:{link}{reference}" for reference in references for link in links]
     texts = [" + ".join(poses), "canonical"] if poses else ["canonical"]
@@ -114,7 +116,7 @@ def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Opera
 
 
 def format_operator(operator: Operator) -> str:
-    """The inverse of :func:`parse_operator`, for people to read.
+    """Write an operator as text, the inverse of :func:`parse_operator`.
 
     Parameters
     ----------
@@ -130,28 +132,9 @@ def format_operator(operator: Operator) -> str:
     'pose:l_hand@bottle'
     """
     if isinstance(operator, Stack):
-        terms = " + ".join(map(format_operator, operator.operators))
-        return PAIR.sub(r"pose\2:\1", terms)
-    one: Any = operator
-    text = _bare(one)
-    if text is None:
+        return PAIR.sub(r"pose\2:\1", " + ".join(map(format_operator, operator.operators)))
+    text = operator.text() if type(operator) in TERMS else None
+    if text is None:  # of a class that the grammar does not know
         return repr(operator)
+    one: Any = operator
     return text if one.tolerance == type(one).tolerance else f"{text}~{one.tolerance!r}"
-
-
-def _bare(one: Any) -> str | None:
-    """Text of an operator without its tolerance; None if there is no such text."""
-    if type(one) is Canonical:
-        text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
-    elif type(one) is Wrench:
-        axes = f"[{''.join(map('xyz'.__getitem__, one.axes))}]" if one.axes else ""
-        text = f"wrench{axes}:{one.link}@{one.frame}"
-    elif type(one) in POSE_OPERATORS:
-        kind = "position" if one.gain is None else "orientation"
-        tangent = "[tangent]" if one.rotation_vector_starts(None) else ""
-        text = f"{kind}{tangent}:{one.link}"
-        if hasattr(one, "frame"):
-            text += f"@{'held:' if one.held else ''}{one.frame}"
-    else:
-        text = None
-    return text

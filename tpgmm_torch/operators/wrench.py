@@ -85,7 +85,7 @@ class Wrench(Operator):
         return False
 
     def dimension(self, kinematics: Kinematics | None) -> int:
-        """A force for each axis, and the contact."""
+        """Return a force for each axis, and the contact."""
         return len(self._axes) + 1
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
@@ -112,7 +112,7 @@ class Wrench(Operator):
         return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
 
     def pose(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Frame:
-        """The pose of the frame; only that of a link needs the state."""
+        """Return the pose of the frame; only that of a link needs the state."""
         if state is not None and self.frame in state.links:
             return state.pose(self.frame)
         if self.frame not in frames:
@@ -121,7 +121,7 @@ class Wrench(Operator):
         return frames[self.frame]
 
     def directions(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Tensor:
-        """The axes (..., n_axes, 3) in the base frame."""
+        """Return the axes (..., n_axes, 3) in the base frame."""
         rotation = quaternions.to_matrix(self.pose(state, frames).orientation)
         return rotation.mT[..., list(self._axes), :]
 
@@ -132,7 +132,7 @@ class Wrench(Operator):
         return (self.directions(state, frames) @ vector.unsqueeze(-1)).squeeze(-1)
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance for each axis; none of the contact."""
+        """Return the tolerance for each axis; none of the contact."""
         return (*[self.tolerance] * len(self._axes), 0.0)
 
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
@@ -140,12 +140,17 @@ class Wrench(Operator):
         return (*["N"] * len(self._axes), None)
 
     def links(self) -> tuple[str, ...]:
-        """The link."""
+        """Return the link."""
         return (self.link,)
 
     def references(self) -> tuple[str, ...]:
-        """The frame."""
+        """Return the frame."""
         return (self.frame,)
+
+    def text(self) -> str:
+        """Write it as a term, see :meth:`Operator.text`."""
+        axes = f"[{''.join(map('xyz'.__getitem__, self.axes))}]" if self.axes else ""
+        return f"wrench{axes}:{self.link}@{self.frame}"
 
     def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that link and frame exist, see :meth:`Operator.check`."""
@@ -180,13 +185,13 @@ class ExpectedForce:
     covariance: Tensor
     share: Tensor
 
-    def scaled(self, weight: Tensor) -> ExpectedForce:
-        """The part of it that is expected with a weight (...)."""
+    def scale(self, weight: Tensor) -> ExpectedForce:
+        """Return the part of it that is expected with a weight (...)."""
         row = weight.unsqueeze(-1)
         force, covariance = row * self.force, row.unsqueeze(-1) * self.covariance
         return ExpectedForce(self.operator, force, covariance, weight * self.share)
 
     def plus(self, other: ExpectedForce) -> ExpectedForce:
-        """The sum of two parts of the expectation of one operator."""
+        """Return the sum of two parts of the expectation of one operator."""
         force, covariance = self.force + other.force, self.covariance + other.covariance
         return ExpectedForce(self.operator, force, covariance, self.share + other.share)

@@ -26,7 +26,7 @@ def _degrees_of_freedom(n_samples: float) -> float:
 
 
 def predictive_scale(n_samples: float | None) -> float:
-    """How much wider a new sample spreads than the covariance of n samples says.
+    """Compute how much wider a new sample spreads than the covariance of n samples says.
 
     ``(n + 1) / (n - 1)``, which Student's t has for its scale matrix.
 
@@ -114,16 +114,16 @@ class Conditionals(_OfComponents):
         return cls(means[:, 1:], gain[..., 0], covariance, means[:, 0], covariances[:, 0, 0])
 
     @classmethod
-    def stacked(cls, parts: Sequence[Conditionals]) -> Conditionals:
-        """The coordinates of all parts side by side, which are independent given time."""
+    def stack(cls, parts: Sequence[Conditionals]) -> Conditionals:
+        """Put coordinates of all parts side by side, which are independent given time."""
         time = parts[0].time_mean, parts[0].time_variance
         covariance = gaussians.block_diagonal([p.covariance for p in parts], time[0].shape)
-        mean = torch.cat([part.recentred(time[0]) for part in parts], -1)
+        mean = torch.cat([part.recenter(time[0]) for part in parts], -1)
         return cls(mean, torch.cat([part.gain for part in parts], -1), covariance, *time)
 
     @classmethod
     def product(cls, parts: Sequence[Conditionals]) -> Conditionals:
-        """The product (2) of Gaussians over the same coordinates, component by component.
+        """Multiply (2) Gaussians over the same coordinates, component by component.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class Conditionals(_OfComponents):
         like, time = parts[0].mean, (parts[0].time_mean, parts[0].time_variance)
         # in float64, as narrow directions lose digits soonest
         covariances = torch.stack([part.covariance.double() for part in parts])
-        means = torch.stack([part.recentred(time[0]).double() for part in parts])
+        means = torch.stack([part.recenter(time[0]).double() for part in parts])
         gains = torch.stack([part.gain.double() for part in parts])
         gain, _ = gaussians.product(gains, covariances)
         mean, covariance = gaussians.product(means, covariances)
@@ -149,7 +149,7 @@ class Conditionals(_OfComponents):
         return self.mean.square() + variance + moved
 
     def marginal(self, coordinates: Tensor) -> Conditionals:
-        """Of some of the coordinates, by their indices."""
+        """Select some of the coordinates, by their indices."""
         covariance = self.covariance[:, coordinates][:, :, coordinates]
         return replace(
             self,
@@ -158,7 +158,7 @@ class Conditionals(_OfComponents):
             covariance=covariance,
         )
 
-    def recentred(self, time_mean: Tensor) -> Tensor:
+    def recenter(self, time_mean: Tensor) -> Tensor:
         """Conditional means at a time of each component's own: shapes (K,) and (K, D)."""
         return self.mean + self.gain * (time_mean - self.time_mean).unsqueeze(-1)
 
@@ -235,7 +235,7 @@ class ActiveComponents:
         return self._sets[bisect.bisect_right(self._edge_list, time)]
 
     def counts(self, time: Tensor) -> Tensor:
-        """Whether each component counts at times of shape (...): bool of shape (..., K)."""
+        """Check which components count at times of shape (...): bool of shape (..., K)."""
         instants = time.detach().double().cpu().contiguous()
         window = torch.bucketize(instants, self._edges, right=True)
         return self._counts[window].to(time.device)

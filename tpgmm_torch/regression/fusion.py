@@ -22,26 +22,13 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.operators import (
-    AbsoluteOrientation,
-    AbsolutePosition,
-    Canonical,
-    Linearization,
-    Operator,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-)
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
+from tpgmm_torch.operators.base import leaves
+from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["KalmanUpdate", "Projection"]
-
-#: Operators whose M has full row rank at every state, so that S is as definite as what was
-#: learned. An operator of another kind may claim to know a direction exactly by mistake, which
-#: the sum of precisions refuses and this form would not notice.
-TASKS = (AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +115,12 @@ class KalmanUpdate:
         local = [one for operator, one in pairs if not _whole(operator)]
         priors = [one for operator, one in pairs if _whole(operator)]
         self.task = Stack(*tasks) if tasks else None
-        self.conditionals = Conditionals.stacked([*local, Conditionals.product(priors)])
+        self.conditionals = Conditionals.stack([*local, Conditionals.product(priors)])
         self._starts = self.task.quaternion_starts(kinematics) if self.task is not None else ()
 
     @staticmethod
     def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
-        """Whether these operators can be fused in this way.
+        """Check that these operators can be fused in this way.
 
         Parameters
         ----------
@@ -145,7 +132,7 @@ class KalmanUpdate:
         if kinematics.quaternion_starts or not any(map(_whole, operators)):
             return False
         tasks = [operator for operator in operators if not _whole(operator)]
-        return all(type(leaf) in TASKS for leaf in leaves(tasks))
+        return all(type(leaf) in POSE_OPERATORS for leaf in leaves(tasks))
 
     def __call__(
         self,
@@ -217,5 +204,5 @@ class KalmanUpdate:
 
 
 def _whole(operator: Operator) -> bool:
-    """Whether an operator is all of the joints."""
+    """Check that an operator is all of the joints."""
     return type(operator) is Canonical and operator.determines_joints

@@ -10,8 +10,7 @@ from typing import ClassVar
 from tpgmm_torch.constraints import Interval, Options
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.base import carried_objects
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import carried_objects, leaves
 from tpgmm_torch.regression.prior import PRIOR_STD, given_widths
 from tpgmm_torch.robots.kinematics import Kinematics
 

@@ -15,6 +15,8 @@ recursive LDL^T updates, IEEE Transactions on Automatic Control 67 (2022): daqp,
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import daqp
 import numpy as np
 import torch
@@ -23,8 +25,9 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.estimate import Estimate
 
-__all__ = ["step_within", "within"]
+__all__ = ["keep_within", "step_within", "within"]
 
 #: Added to unit variances before they are inverted: rounding may have made them singular.
 JITTER = 1e-12
@@ -33,7 +36,7 @@ FOUND, NOT_CONVEX = 1, -5
 
 
 def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """The most likely joints within bounds: exact, for each robot of a batch.
+    """Find the most likely joints within bounds: exact, for each robot of a batch.
 
     The other joints take over as the Gaussian says: clipping alone would move the hands away
     from where they are wanted.
@@ -69,7 +72,7 @@ def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Te
         unit.diagonal(dim1=-2, dim2=-1).add_(JITTER)
         precision = torch.cholesky_inverse(gaussians.cholesky(unit, "the product"))
         low, high = ((bound - means) / deviation for bound in (lowers, uppers))
-        _, multipliers = _solved(precision, torch.zeros_like(means), low, high)
+        _, multipliers = _solve_program(precision, torch.zeros_like(means), low, high)
         sides = torch.from_numpy(np.sign(multipliers)).to(means)  # positive at upper bounds
     stands = sides != 0
     bound = torch.where(sides > 0, uppers, torch.where(stands, lowers, means))
@@ -83,10 +86,18 @@ def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Te
     return whole
 
 
+def keep_within(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
+    """Return an ``estimate`` given that joints keep within ``bounds``, if there are some."""
+    if bounds is None:
+        return estimate
+    joints = within(estimate.joints, estimate.covariance, *bounds)
+    return estimate if joints is estimate.joints else replace(estimate, joints=joints)
+
+
 def step_within(
     joints: Tensor, vector: Tensor, precision: Tensor, lower: Tensor, upper: Tensor
 ) -> Tensor:
-    """Where a quadratic cost is least within bounds: exact, for each robot of a batch.
+    """Minimise a quadratic cost within bounds: exact, for each robot of a batch.
 
     What :func:`within` says of ``N(joints + precision^-1 vector, precision^-1)``, for those who
     know the precision.
@@ -106,14 +117,14 @@ def step_within(
         If a precision is singular.
     """
     lower = torch.minimum(lower, upper)
-    steps, _ = _solved(precision, vector, lower - joints, upper - joints)
+    steps, _ = _solve_program(precision, vector, lower - joints, upper - joints)
     return torch.clamp(joints + torch.from_numpy(steps).to(joints), lower, upper)
 
 
-def _solved(
+def _solve_program(
     precision: Tensor, vector: Tensor, low: Tensor, high: Tensor
 ) -> tuple[Array, Array]:
-    """The minimum of ``x^T precision x / 2 - vector^T x`` within bounds, and multipliers.
+    """Minimise ``x^T precision x / 2 - vector^T x`` within bounds; also return multipliers.
 
     Of unit precisions alone the solver finds it where the joints are far from equally stiff.
     """

@@ -30,10 +30,10 @@ from torch import Tensor
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import leaves
+from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.regression.fusion import TASKS
 from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -103,7 +103,7 @@ class PostureSearch:
         asked: Tensor,
         state_at: Callable[[Tensor], RobotState] | None = None,
     ) -> tuple[Tensor, Self]:
-        """The nearest posture of each robot, and the search for the next tick.
+        """Return the nearest posture of each robot, and the search for the next tick.
 
         Parameters
         ----------
@@ -132,9 +132,9 @@ class PostureSearch:
         """
         rows = asked if self.active is None else asked | self.active
         if not bool(rows.any()):
-            return estimate.joints, self.begun()
+            return estimate.joints, self.reset()
         with torch.inference_mode():
-            trust, goal, *state = self._searched(
+            trust, goal, *state = self._search_rows(
                 time, reference, frames, estimate, bounds, rows, state_at
             )
         goal, trust = goal.clone(), trust.clone()
@@ -145,18 +145,18 @@ class PostureSearch:
         searched = replace(self, active=active, postures=postures, damping=damping, age=age)
         return wanted, searched
 
-    def begun(self) -> Self:
-        """The same before any robot is searched for."""
+    def reset(self) -> Self:
+        """Return the same before any robot is searched for."""
         return replace(self, active=None, postures=None, damping=None, age=None)
 
-    def ended(self, robots: Tensor) -> Self:
-        """The same without the searches of robots (...) that were displaced."""
+    def drop_robots(self, robots: Tensor) -> Self:
+        """Return the same without the searches of robots (...) that were displaced."""
         active = None if self.active is None else self.active & ~robots
         if active is None or not bool(active.any()):
-            return self.begun()
+            return self.reset()
         return replace(self, active=active)
 
-    def _searched(
+    def _search_rows(
         self,
         time: Tensor,
         reference: Tensor,
@@ -255,7 +255,7 @@ def descend(
     lower: Tensor,
     upper: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """A step of Levenberg's and Marquardt's method within bounds, with one evaluation.
+    """Return a step of Levenberg's and Marquardt's method within bounds, with one evaluation.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ class Residual:
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
         parts: Sequence[Any] = leaves([operator])
-        parts = parts if all(type(leaf) in TASKS for leaf in parts) else ()
+        parts = parts if all(type(leaf) in POSE_OPERATORS for leaf in parts) else ()
         column = 0
         with torch.inference_mode(False):  # as it serves where gradients are wanted, too
             like = kinematics.lower.new_ones(len(parts))
@@ -425,20 +425,28 @@ class Residual:
         moved = mean if at.matrix is None else (at.matrix @ mean.unsqueeze(-1))[..., 0]
         residual, jacobian = moved + at.displacement, at.jacobian
         # orientations that are tracked have four rows, which are linear in the joints
-        if jacobian is None or residual.shape[-1] != 3 * len(self.leaves):
-            return matrix, residual, jacobian, at.noise
-        own, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
-        if self.turning is not None:
-            assert present is not None  # there are quaternions
-            share, whole, half = self.turning
-            cosine = whole + (mean * present) @ share
-            own = cosine[..., None, None] * own + _cross(half * still, own)
+        if jacobian is not None and residual.shape[-1] == 3 * len(self.leaves):
+            cosine = None
+            if self.turning is not None:
+                assert present is not None  # there are quaternions
+                cosine = self.turning[1] + (mean * present) @ self.turning[0]
+            jacobian = self._turn_jacobian(jacobian, residual, cosine, state)
+        return matrix, residual, jacobian, at.noise
+
+    def _turn_jacobian(
+        self, jacobian: Tensor, residual: Tensor, cosine: Tensor | None, state: RobotState
+    ) -> Tensor:
+        """Add to a linearisation's Jacobian what a rotation that is still to go adds."""
+        rows, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
+        if cosine is not None and self.turning is not None:
+            rows = cosine[..., None, None] * rows + _cross(self.turning[2] * still, rows)
         for row, leaf in enumerate(self.leaves):
             if leaf is None or (reference := leaf.moving_reference(state)) is None:
                 continue
-            own = own.expand(*still.shape, -1).clone()
-            own[..., row, :, :] += _cross(still[..., row, :], state.angular_jacobian(reference))
-        return matrix, residual, own.flatten(-3, -2), at.noise
+            rows = rows.expand(*still.shape, -1).clone()
+            angular = state.angular_jacobian(reference)
+            rows[..., row, :, :] += _cross(still[..., row, :], angular)
+        return rows.flatten(-3, -2)
 
 
 def _cross(vector: Tensor, matrix: Tensor) -> Tensor:

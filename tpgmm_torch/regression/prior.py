@@ -119,12 +119,15 @@ def _size(
     weights: Tensor,
 ) -> Tensor:
     """Root mean square of the learned positions, in their unit; 1 where there are none."""
-    squares = []
+    squares = [weights[:0]]
     for operator, one in zip(operators, conditionals, strict=True):
-        turns = {s + i for s in operator.quaternion_starts(kinematics) for i in range(4)}
-        turns |= {s + i for s in operator.rotation_vector_starts(kinematics) for i in range(3)}
-        if operator.links():
-            columns = [i for i in range(one.mean.shape[-1]) if i not in turns]
-            squares.append(weights @ one.second_moment[:, columns])
-    together = torch.cat(squares) if squares else weights[:0]
+        if not operator.links():
+            continue
+        turned = torch.zeros(one.mean.shape[-1], dtype=torch.bool)
+        for start in operator.quaternion_starts(kinematics):
+            turned[start : start + 4] = True
+        for start in operator.rotation_vector_starts(kinematics):
+            turned[start : start + 3] = True
+        squares.append(weights @ one.second_moment[:, ~turned.to(weights.device)])
+    together = torch.cat(squares)
     return together.mean().sqrt() if bool(together.any()) else weights.new_ones(())

@@ -24,9 +24,8 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
-from tpgmm_torch.operators.base import carried_objects, frame_names, of_joints
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators import Linearization, Operator, Stack
+from tpgmm_torch.operators.base import carried_objects, frame_names, leaves, of_joints
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import (
     ActiveComponents,
@@ -37,7 +36,7 @@ from tpgmm_torch.regression.conditionals import (
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
-from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.posture import PostureSearch, Residual
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
@@ -103,7 +102,7 @@ class Regression:
         The form of the product (2), and its settings.
     n_samples : float, optional
         Of each component, if joints shall give way by what few of them leave unknown, see
-        :attr:`fused`.
+        :attr:`scaled_conditionals`.
     begin, end : float
         Start and end of the skill [s].
     holds : tuple of Hold
@@ -134,7 +133,7 @@ class Regression:
 
     @classmethod
     def of(cls, learned: Learned, fusion: Fusion, *, moderated: bool) -> Self:
-        """A learned mixture, conditioned on time (eqs 1 to 3).
+        """Return a learned mixture, conditioned on time (eqs 1 to 3).
 
         Parameters
         ----------
@@ -182,10 +181,10 @@ class Regression:
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
-            found = self._unbounded(time, state, frames)
+            found = self._estimate_together(time, state, frames)
         else:
             found = self._in_parts(batch, time, state, poses)
-        found = self.bounded(found, bounds)
+        found = keep_within(found, bounds)
         if candidates:
             own = self.candidates(time, self._state(state), frames, found)
             found = replace(found, candidates=own)
@@ -222,7 +221,7 @@ class Regression:
         step, covariance = gaussians.moment_match(weights, steps, covariances)
         return state.joints + step, covariance, weights
 
-    def expected(self, operator: int, time: Tensor) -> Tensor:
+    def expect(self, operator: int, time: Tensor) -> Tensor:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
         means = self.conditionals[operator].at(time)
         return (self.weights_at(time).unsqueeze(-2) @ means).squeeze(-2)
@@ -232,7 +231,7 @@ class Regression:
         return torch.softmax(self.marginals.log_activation(time.unsqueeze(-1)), -1)
 
     def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
-        """Of each :class:`Wrench` at times (...); see :meth:`Skill.expected_forces`."""
+        """Expect a force for each :class:`Wrench`; see :meth:`Skill.expected_forces`."""
         first, found = len(of_joints(self.operators)), []
         pairs = zip(self.operators[first:], self.conditionals[first:], strict=True)
         for operator, one in pairs:
@@ -263,33 +262,33 @@ class Regression:
         with torch.inference_mode():
             return torch.from_numpy(self._likelihoods[key](state, frames, window))
 
-    def observed(self, names: frozenset[str]) -> Regression | None:
-        """The mixture of observed operators; see :meth:`Skill.observed`.
+    def restrict_to(self, names: frozenset[str]) -> Regression | None:
+        """Return the mixture of observed operators; see :meth:`Skill.restrict_to`.
 
         Of a stack of operators, those of which all frames and links are observed are kept.
         """
-        if names in self._observed:
-            return self._observed[names]
+        if names not in self._restrictions:
+            self._restrictions[names] = self._restrict_to(names)
+        return self._restrictions[names]
+
+    def _restrict_to(self, names: frozenset[str]) -> Regression | None:
         pairs = zip(self.operators, self.conditionals, strict=True)
         every = enumerate(self._part(operator, one, names) for operator, one in pairs)
         kept = {index: part for index, part in every if part is not None}
-        operators = tuple(operator for operator, _ in kept.values())
-        found: Regression | None = None
+        operators, fusion = tuple(operator for operator, _ in kept.values()), self.fusion
         if list(operators) == list(self.operators):
-            found = self
-        elif of_joints(operators):
-            _, conditionals = zip(*kept.values(), strict=True)
-            fusion = self.fusion
-            if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
-                fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
-            found = replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
-        self._observed[names] = found
-        return found
+            return self
+        if not of_joints(operators):
+            return None
+        if fusion.priorities is not None:
+            fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
+        _, conditionals = zip(*kept.values(), strict=True)
+        return replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
 
     def _part(
         self, operator: Operator, one: Conditionals, names: frozenset[str]
     ) -> tuple[Operator, Conditionals] | None:
-        """The part of an operator that needs no other frames and links than these."""
+        """Return the part of an operator that needs no other frames and links than these."""
         members = leaves([operator])
         there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
         if all(there):
@@ -302,7 +301,7 @@ class Regression:
         return Stack(*seen), one.marginal(columns)
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
-        """The same for all robots; see :meth:`Skill.start`."""
+        """Return the same for all robots; see :meth:`Skill.start`."""
         return self
 
     def of_robots(self, robots: Tensor) -> Regression:
@@ -310,7 +309,7 @@ class Regression:
         return self
 
     def advance(self, estimate: Estimate) -> Regression:
-        """The same at all ticks; see :meth:`Skill.advance`."""
+        """Return the same at all ticks; see :meth:`Skill.advance`."""
         return self
 
     def posture_search(self) -> PostureSearch:
@@ -321,7 +320,9 @@ class Regression:
     def _search(self) -> PostureSearch:
         own = of_joints(self.operators)
         terms = [Residual.of(operator, self.kinematics) for operator in own]
-        return PostureSearch(self.kinematics, terms, self.fused, self.free_precision)
+        return PostureSearch(
+            self.kinematics, terms, self.scaled_conditionals, self.free_precision
+        )
 
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
@@ -347,7 +348,7 @@ class Regression:
         return torch.logsumexp(total, -1)
 
     def surprise(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> Tensor:
-        """How much less likely local coordinates are than those that are expected [nats].
+        """Compute how much less likely local coordinates are than those expected [nats].
 
         Parameters
         ----------
@@ -365,7 +366,7 @@ class Regression:
         for j, operator in enumerate(of_joints(self.operators)):
             rows = operator.at(time).coordinates(state, frames)
             rows = rows.expand(*batch, -1).reshape(len(times), -1)
-            wanted = self.expected(j, times)
+            wanted = self.expect(j, times)
             starts = operator.quaternion_starts(self.kinematics)
             local.append(quaternions.hemisphere_signs(rows, wanted, starts) * rows)
             expected.append(wanted)
@@ -400,7 +401,7 @@ class Regression:
         return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
-    def fused(self) -> tuple[Conditionals, ...]:
+    def scaled_conditionals(self) -> tuple[Conditionals, ...]:
         """The conditionals as they are fused: with covariances that say who gives way.
 
         Those of what has priority are scaled down. As that scale goes to zero, the product (2)
@@ -415,7 +416,7 @@ class Regression:
         operators = of_joints(self.operators)
         priorities = self.fusion.priorities or [0] * len(operators)
         levels = sorted(set(priorities))
-        alone = all(isinstance(leaf, Canonical) for leaf in leaves(operators))
+        alone = all(leaf.is_posture for leaf in leaves(operators))
         wider = 1.0 if alone else math.sqrt(predictive_scale(self.n_samples))
         fused = []
         # what is made while inference mode is on could not serve where gradients are wanted
@@ -424,7 +425,7 @@ class Regression:
             parts = zip(local, operators, priorities, strict=True)
             for one, operator, priority in parts:
                 members = leaves([operator])
-                widths = [wider if isinstance(leaf, Canonical) else 1.0 for leaf in members]
+                widths = [wider if leaf.is_posture else 1.0 for leaf in members]
                 sizes = [leaf.dimension(self.kinematics) for leaf in members]
                 scale = one.covariance.new_tensor(np.repeat(widths, sizes))
                 own = STRICT ** levels.index(priority)
@@ -441,7 +442,7 @@ class Regression:
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return KalmanUpdate(self.kinematics, operators, self.fused)
+            return KalmanUpdate(self.kinematics, operators, self.scaled_conditionals)
 
     @cached_property
     def free_precision(self) -> Tensor:
@@ -472,12 +473,17 @@ class Regression:
         """See :attr:`Skill.gates`."""
         return ()
 
+    @property
+    def summaries(self) -> tuple[TrainingSummary, ...]:
+        """See :attr:`Skill.summaries`."""
+        return () if self.summary is None else (self.summary,)
+
     @cached_property
     def _likelihoods(self) -> dict[bytes, TimeLikelihood]:
         return {}
 
     @cached_property
-    def _observed(self) -> dict[frozenset[str], Regression | None]:
+    def _restrictions(self) -> dict[frozenset[str], Regression | None]:
         return {}
 
     @cached_property
@@ -490,7 +496,7 @@ class Regression:
     @cached_property
     def components(self) -> Components:
         """All components of the mixture."""
-        conditionals = self.fused
+        conditionals = self.scaled_conditionals
         if self._update is not None:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)
@@ -499,7 +505,7 @@ class Regression:
 
     @cached_property
     def _active(self) -> ActiveComponents | None:
-        """Which components count when, where not all do at any time."""
+        """Components that count at each time, where not all do at any."""
         learning = self.log_weights.requires_grad or self.conditionals[0].mean.requires_grad
         fusion = self.fusion
         if fusion.activation != "time" or fusion.negligible == 0 or learning:
@@ -507,7 +513,7 @@ class Regression:
         return ActiveComponents(self.marginals, fusion.negligible)
 
     @cached_property
-    def _selected(self) -> dict[tuple[int, ...], Components]:
+    def _selections(self) -> dict[tuple[int, ...], Components]:
         return {}
 
     def _components_at(self, time: Tensor) -> Components:
@@ -519,10 +525,10 @@ class Regression:
         else:
             counts = self._active.counts(time).flatten(0, -2).any(0)
             active = tuple(counts.nonzero()[:, 0].tolist())
-        if active not in self._selected:
+        if active not in self._selections:
             with torch.inference_mode(False):
-                self._selected[active] = self._select(active)
-        return self._selected[active]
+                self._selections[active] = self._select(active)
+        return self._selections[active]
 
     def _select(self, active: tuple[int, ...]) -> Components:
         return self.components.select(active)
@@ -559,7 +565,7 @@ class Regression:
     def _state(self, state: Tensor | RobotState) -> RobotState:
         return state if isinstance(state, RobotState) else self.kinematics.state(state)
 
-    def _unbounded(
+    def _estimate_together(
         self, time: Tensor, state: Tensor | RobotState, frames: Mapping[str, Frame]
     ) -> Estimate:
         components = self._components_at(time)
@@ -573,7 +579,7 @@ class Regression:
         state: Tensor | RobotState,
         frames: Mapping[str, Frame],
     ) -> Estimate:
-        """Of many robots, part by part, of those that are at about the same time."""
+        """Estimate many robots part by part, those together that are at about the same time."""
         if isinstance(state, RobotState):
             state = state.flatten(batch)
         else:
@@ -584,7 +590,9 @@ class Regression:
         parts = []
         for part in order.split(PART):
             here = {name: pose[part] for name, pose in poses.items()}
-            parts.append(self._unbounded(time[part] if time.ndim else time, state[part], here))
+            parts.append(
+                self._estimate_together(time[part] if time.ndim else time, state[part], here)
+            )
         back = order.argsort()
 
         def whole(name: str) -> Tensor:
@@ -596,14 +604,6 @@ class Regression:
             whole("covariance"),
             whole("activation") if activation.ndim > 1 else activation,
         )
-
-    @staticmethod
-    def bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
-        """An ``estimate``, given that joints keep within ``bounds`` if there are some."""
-        if bounds is None:
-            return estimate
-        joints = within(estimate.joints, estimate.covariance, *bounds)
-        return estimate if joints is estimate.joints else replace(estimate, joints=joints)
 
     def _local(
         self,

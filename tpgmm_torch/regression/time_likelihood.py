@@ -22,7 +22,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators import Operator, Stack
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -127,7 +127,7 @@ class _Coordinates:
         weights: Array,
         slack: float,
     ) -> None:
-        self._mean, self._gain = _array(one.recentred(first.time_mean)), _array(one.gain)
+        self._mean, self._gain = _array(one.recenter(first.time_mean)), _array(one.gain)
         sizes = [leaf.dimension(kinematics) for leaf in leaves([operator])]
         groups = np.repeat(np.arange(len(sizes)), sizes)
         # how far coordinates move in the skill, alike for those of one leaf

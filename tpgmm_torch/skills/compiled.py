@@ -29,6 +29,7 @@ from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.regression import Components, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
@@ -67,7 +68,7 @@ def compile_skill(
     """
     if backend == "inductor":
         _check_compiler("compile_skill")
-    compiled = _compiled(skill, "compile_skill", backend)
+    compiled = _wrap(skill, "compile_skill", backend)
     like = skill.kinematics.lower
     batch = () if n_robots == 1 else (n_robots,)
     here = Frame(like.new_zeros(*batch, 3))
@@ -108,7 +109,7 @@ def export_estimate(skill: Regression, path: str | Path) -> None:
             f"export_estimate() takes a skill in float64 on the CPU, got {like.dtype} on "
             f"{like.device}: fit the model with dtype='float64', device='cpu'"
         )
-    names = _compiled(skill, "export_estimate").frame_names
+    names = _wrap(skill, "export_estimate").frame_names
     contents = {
         "n_joints": len(like),
         "n_frames": len(names),
@@ -119,7 +120,7 @@ def export_estimate(skill: Regression, path: str | Path) -> None:
     }
     with _tracing(), replacing(path) as file:
         examples = like.new_zeros(()), torch.zeros_like(like), like.new_ones(len(names), 7)
-        program = _traced(_OneRobot(skill), examples)
+        program = _trace(_OneRobot(skill), examples)
         package = file.with_name("estimate.pt2")  # PyTorch wants this ending
         torch._inductor.aoti_compile_and_package(
             program,
@@ -153,40 +154,38 @@ class CompiledRegression(Regression):
         candidates: bool = False,
     ) -> Estimate:
         """Gaussian of the joints; see :meth:`Regression.estimate`."""
-        if isinstance(state, RobotState) or not self._serves(time, state, frames):
+        found = None
+        if isinstance(state, Tensor) and self._serves(time, state, frames):
+            found = self._run_graph(time, state, [frames[name] for name in self.frame_names])
+        if found is None:
             return super().estimate(time, state, frames, bounds)
-        names, like = self.frame_names, self.kinematics.lower
-        poses = [frames[name] for name in names]
-        batch = gaussians.common_shape(state.shape[:-1], *(pose.batch_shape for pose in poses))
-        count = batch.numel()
-        if count == 0:
-            return super().estimate(time, state, frames, bounds)
-        rows = [state, *(pose.position for pose in poses)]
+        return keep_within(found, bounds)
+
+    def _run_graph(self, time: Tensor, joints: Tensor, poses: list[Frame]) -> Estimate | None:
+        """Estimate by the graph; None if not finite, of which the plain one says why."""
+        like = self.kinematics.lower
+        batch = gaussians.common_shape(joints.shape[:-1], *(pose.batch_shape for pose in poses))
+        if batch.numel() == 0:
+            return None
+        rows = [joints, *(pose.position for pose in poses)]
         rows += [pose.orientation for pose in poses]
-        # a graph takes one dtype, and contiguous rows
-        rows = [row.to(like).expand(*batch, -1).reshape(count, -1) for row in rows]
-        size = PART if count > 1 and not like.is_cuda else count
-        if spare := -count % size:
-            rows = [torch.cat((row, row[:1].expand(spare, -1))) for row in rows]
+        # a graph takes one dtype
+        rows = [row.to(like).expand(*batch, -1).reshape(batch.numel(), -1) for row in rows]
         components = self._components_at(time)
         [conditionals] = components.conditionals
         shared = [time.to(like), *vars(components.marginals).values()]
         shared += vars(conditionals).values()
-        results = [
-            self._run([*part, *shared])
-            for part in zip(*(row.contiguous().split(size) for row in rows), strict=True)
-        ]
+        results = [self._run([*part, *shared]) for part in _split(rows)]
         mean, covariance = (
-            torch.cat(parts)[:count].view(*batch, *parts[0].shape[1:])
+            torch.cat(parts)[: batch.numel()].view(*batch, *parts[0].shape[1:])
             for parts in list(zip(*results, strict=True))[:2]
         )
-        if not math.isfinite(mean.sum().item()):  # the plain estimate says what is wrong
-            return super().estimate(time, state, frames, bounds)
-        estimate = Estimate(mean, covariance, results[0][2] @ components.places)
-        return self.bounded(estimate, bounds)
+        if not math.isfinite(mean.sum().item()):
+            return None
+        return Estimate(mean, covariance, results[0][2] @ components.places)
 
     def _serves(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> bool:
-        """Whether the graph gives this estimate: few components, no gradients, all frames."""
+        """Check that the graph serves: few components, no gradients, all frames."""
         differentiated = torch.is_grad_enabled() and joints.requires_grad
         if time.ndim or differentiated or joints.shape[-1:] != self.kinematics.lower.shape:
             return False
@@ -209,10 +208,10 @@ class CompiledRegression(Regression):
         return {}
 
     def _compile(self, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], Sequence[Tensor]]:
-        """The graph for inputs of such shapes."""
+        """Return the graph for inputs of such shapes."""
         with _tracing():
             examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
-            program = _traced(_Fusion(self), examples)
+            program = _trace(_Fusion(self), examples)
             if self.backend != "inductor":
                 graph = torch.compile(program.module(), backend=self.backend, fullgraph=True)
                 return lambda inputs: graph(*inputs)
@@ -224,15 +223,24 @@ class CompiledRegression(Regression):
 
     @cached_property
     def _largest(self) -> int:
-        """How many components a graph takes."""
+        """Number of components that a graph takes."""
         return len(self.log_weights) if self._active is None else self._active.largest
 
     def _select(self, active: tuple[int, ...]) -> Components:
-        """Of one size within the windows: components that are added have no weight."""
+        """Select as many in all windows: components that are added have no weight."""
         spare = active[:1] * (self._largest - len(active))
         components = super()._select((*active, *spare))
         components.marginals.log_peak[len(active) :] = -torch.inf
         return components
+
+
+def _split(rows: list[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+    """Split rows of many robots into contiguous parts of one size, filled up with the first."""
+    count = len(rows[0])
+    size = PART if count > 1 and not rows[0].is_cuda else count
+    if spare := -count % size:
+        rows = [torch.cat((row, row[:1].expand(spare, -1))) for row in rows]
+    return zip(*(row.contiguous().split(size) for row in rows), strict=True)
 
 
 class _Fusion(torch.nn.Module):
@@ -274,7 +282,7 @@ class _OneRobot(torch.nn.Module):
         return mean[0], covariance[0]
 
 
-def _traced(
+def _trace(
     module: torch.nn.Module, examples: tuple[Tensor, ...]
 ) -> torch.export.ExportedProgram:
     module(*examples)  # caches must hold tensors, not what a trace puts in their place
@@ -290,8 +298,8 @@ def _tracing() -> Iterator[None]:
         yield
 
 
-def _compiled(skill: Regression, purpose: str, backend: str = "inductor") -> CompiledRegression:
-    """The skill with graphs, if it is of a kind that these serve."""
+def _wrap(skill: Regression, purpose: str, backend: str = "inductor") -> CompiledRegression:
+    """Return the skill with graphs, if it is of a kind that these serve."""
     settings = {field.name: getattr(skill, field.name) for field in fields(Regression)}
     compiled = CompiledRegression(**settings, backend=backend)
     links, task = skill.kinematics.links, compiled._update and compiled._update.task
@@ -310,7 +318,7 @@ def _compiled(skill: Regression, purpose: str, backend: str = "inductor") -> Com
 
 
 def _is_fixed(operator: Operator, links: Sequence[str]) -> bool:
-    """Whether an operator is about one link, seen from what does not move with the joints."""
+    """Check that an operator is about one link, seen from what no joint moves."""
     about, *things = operator.links()
     refers = set(things) | set(operator.references())
     seen_from_link = bool(refers & set(links)) or bool(things) or about not in links

@@ -55,5 +55,5 @@ class Gate:
 
     @property
     def onward(self) -> float:
-        """Where time goes on from when the gate opens: the next skill takes over [s]."""
+        """Time from which the next skill takes over when the gate opens [s]."""
         return self.time + SWITCH * self.fade

@@ -73,7 +73,7 @@ class Held:
 
     @property
     def is_held(self) -> Tensor:
-        """Whether a link holds it, of shape () or (...)."""
+        """True where a link holds it, of shape () or (...)."""
         return self.carrier >= 0
 
     @property
@@ -83,7 +83,7 @@ class Held:
 
     @property
     def moves_along(self) -> Tensor:
-        """Whether it was seen to move with its link (...)."""
+        """True where it was seen to move with its link (...)."""
         assert self.apart is not None
         return self.apart.position.isinf().all(-1)
 
@@ -165,7 +165,7 @@ class Holding:
 
     @property
     def carries(self) -> bool:
-        """Whether one of the objects may be held by some robot."""
+        """True if one of the objects may be held by some robot."""
         return any(
             name in self.held and self.held[name].grasp is not None for name in self.objects
         )
@@ -180,7 +180,7 @@ class Holding:
         dt: float | Tensor = 0.0,
         shares: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> Self:
-        """The next tick.
+        """Return the next tick.
 
         Parameters
         ----------
@@ -219,24 +219,26 @@ class Holding:
             before = self.held.get(name, FREE).later(pose, joints, shares.get(name))
             carrier = self._carrier(name, torch.as_tensor(time), before, given, where)
             place = self.frames.get(name, places[name])
-            after, places[name] = self._changed(name, before, carrier, place, pose, state_now)
-            after = self._seen(before, after, pose, state_now, dt)
+            after, places[name] = self._change_carrier(
+                name, before, carrier, place, pose, state_now
+            )
+            after = self._on_reading(before, after, pose, state_now, dt)
             if after is not FREE:
                 held[name] = after
         return replace(self, frames=places, held=self.held if held == self.held else held)
 
     def free(self, name: str, like: Tensor) -> Tensor:
-        """For which robots an object is free: bool, of the shape of ``like``."""
+        """Check for which robots an object is free: bool, of the shape of ``like``."""
         carrier = self.held.get(name, FREE).carrier
         return carrier.to(like.device).expand(like.shape) < 0
 
     def busy(self, like: Tensor) -> Tensor:
-        """Which robots hold something: bool, of the shape of ``like``."""
+        """Check which robots hold something: bool, of the shape of ``like``."""
         none = torch.zeros_like(like, dtype=torch.bool)
         return torch.stack([none, *(~self.free(n, like) for n in self.held)]).any(0)
 
-    def taken(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
-        """A link holds an object, as if that had been given.
+    def take(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
+        """Return a link holds an object, as if that had been given.
 
         Parameters
         ----------
@@ -250,21 +252,21 @@ class Holding:
             Pose of the object when it was last free; its pose in the link now.
         """
         before = self.held.get(name, FREE)
-        old, apart = grasp if before.grasp is None else before.grasp, before.apart
+        apart = before.apart
         now = replace(
             before,
             carrier=torch.where(where, index, before.carrier),
-            grasp=choose(where, grasp, old),
-            taken=choose(where, place, place if before.taken is None else before.taken),
+            grasp=choose(where, grasp, before.grasp),
+            taken=choose(where, place, before.taken),
             given=where | before.given,
             apart=None if apart is None else choose(where, _constant(apart, math.inf), apart),
-            joints=_restarted(before.joints, where),
+            joints=_restart_lag(before.joints, where),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
 
-    def ungiven(self, name: str, where: Tensor) -> Self:
-        """The skill's holds of an object count again, whatever was given before.
+    def clear_override(self, name: str, where: Tensor) -> Self:
+        """Return the skill's holds of an object count again, whatever was given before.
 
         Parameters
         ----------
@@ -278,7 +280,7 @@ class Holding:
         now = replace(before, given=before.given & ~where)
         return replace(self, held={**self.held, name: now})
 
-    def released(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
+    def release(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
         """Some robots hold nothing, and objects are where they are seen.
 
         From the next tick on the skill says what they hold.
@@ -296,7 +298,7 @@ class Holding:
             held[name] = replace(before, carrier=carrier, given=before.given & ~robots)
         return replace(self, frames=frames, held=held)
 
-    def restarted(self, robots: Tensor, joints: Tensor) -> Self:
+    def restart(self, robots: Tensor, joints: Tensor) -> Self:
         """Objects that some robots hold are, as places, where they are now.
 
         Parameters
@@ -310,15 +312,15 @@ class Holding:
         for name, held in self.held.items():
             where = robots & held.is_held
             if bool(where.any()):
-                frames[name] = choose(where, self.carried(name, state), frames[name])
+                frames[name] = choose(where, self.locate(name, state), frames[name])
         return replace(self, frames=frames)
 
-    def carried(self, name: str, state: RobotState) -> Frame:
+    def locate(self, name: str, state: RobotState) -> Frame:
         """Pose of an object that is or was held, if its link has it still."""
         return self._with(state, name, self.held[name]).pose(name)
 
     def state(self, state: RobotState) -> RobotState:
-        """The state of the robots with the objects that they hold, as operators refer to it.
+        """Add to the state of the robots the objects that they hold, as operators need them.
 
         Parameters
         ----------
@@ -338,7 +340,7 @@ class Holding:
         given: Mapping[str, str | None],
         where: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """The link that holds an object now, and for which robots that was given."""
+        """Return the link that holds an object now, and for which robots that was given."""
         links, carrier = self.kinematics.links, NOBODY
         for hold in self.holds:
             if hold.frame == name:
@@ -355,7 +357,7 @@ class Holding:
             return torch.tensor(index), torch.tensor(True)
         return torch.where(where, index, carrier), before.given | where
 
-    def _changed(
+    def _change_carrier(
         self,
         name: str,
         before: Held,
@@ -364,7 +366,7 @@ class Holding:
         seen: Frame | None,
         state_now: Callable[[], RobotState],
     ) -> tuple[Held, Frame]:
-        """An object after its carrier may have changed, and its place."""
+        """Return an object after its carrier may have changed, and its place."""
         carrier, given = now_held
         if bool((carrier == before.carrier).all()):
             pose = _unless(before.taken, place if seen is None else seen, place)
@@ -378,7 +380,6 @@ class Holding:
         grasp, apart = before.grasp, before.apart
         for index in replace(before, carrier=carrier).carriers:
             other = now.seen_from(state.pose(self.kinematics.links[index]))
-            grasp = other if grasp is None else grasp
             apart = _constant(other, math.inf) if apart is None else apart
             news = (carrier == index) & (before.carrier != index)
             grasp = choose(news, other, grasp)
@@ -387,14 +388,14 @@ class Holding:
             before,
             carrier=carrier,
             grasp=grasp,
-            taken=now if before.taken is None else choose(held | ~holds, before.taken, now),
+            taken=choose(~held & holds, now, before.taken),
             given=given,
             apart=apart,
-            joints=_restarted(before.joints, holds & ~held),
+            joints=_restart_lag(before.joints, holds & ~held),
         )
         return after, choose(held & holds, place, now)
 
-    def _seen(
+    def _on_reading(
         self,
         before: Held,
         held: Held,
@@ -402,19 +403,19 @@ class Holding:
         state_now: Callable[[], RobotState],
         dt: float | Tensor,
     ) -> Held:
-        """An object after it was seen, by robots that held it before."""
+        """Return an object after it was seen, by robots that held it before."""
         if seen is None or before.taken is None or before.apart is None:
             return held
         unseen = _same(seen, before.taken)
         live = held.is_held & (held.carrier == before.carrier) & ~unseen
         if bool((held.rests & unseen).any()):  # it may be lifted by now
             held = replace(held, rests=held.rests & ~unseen)
-        return self._observed(held, seen, live, state_now(), dt) if bool(live.any()) else held
+        return self._observe(held, seen, live, state_now(), dt) if bool(live.any()) else held
 
-    def _observed(
+    def _observe(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
     ) -> Held:
-        """A held object after it was seen by some robots."""
+        """Return a held object after it was seen by some robots."""
         assert held.grasp is not None
         grasp, link_pose, moving = held.grasp, held.link, held.moves_along
         dt, then = torch.as_tensor(dt, dtype=grasp.position.dtype), state
@@ -435,12 +436,12 @@ class Holding:
         held = replace(held, grasp=grasp, link=link_pose)
         if bool((moving | ~held.is_held).all()):
             return held
-        return self._shifted(held, seen, live & ~moving, state, then)
+        return self._estimate_grasp(held, seen, live & ~moving, state, then)
 
-    def _shifted(
+    def _estimate_grasp(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, then: RobotState
     ) -> Held:
-        """A held object that may be shifted in its link, after it was seen by some robots.
+        """Estimate the grasp of an object that may be shifted in its link, after a reading.
 
         Whether it moves with its link is asked of the posture ``then``, as late as it is seen.
         While it rests, it is not late, and its grasp is that of the posture now.
@@ -448,13 +449,12 @@ class Holding:
         assert held.grasp is not None and held.apart is not None
         grasp, apart, rests = held.grasp, held.apart, held.rests
         begins, first_link, first = apart.position.isnan().all(-1), held.link, held.first
-        shown = grasp if held.shown is None else choose(begins, grasp, held.shown)
+        shown = choose(begins, grasp, held.shown)
         for index in held.carriers:
             link, now = (s.pose(self.kinematics.links[index]) for s in (then, state))
             together, here = seen.seen_from(link), live & (held.carrier == index)
-            first_link = link if first_link is None else first_link
             first_link = choose(here & begins, link, first_link)
-            first = seen if first is None else choose(here & begins, seen, first)
+            first = choose(here & begins, seen, first)
             # it rests if it moved by less than half of the link's motion
             stirred = first_link.change(link, MOVED, TURNED)
             still = (stirred > 0.1) & (first.change(seen, MOVED, TURNED) < 0.5 * stirred)
@@ -470,11 +470,11 @@ class Holding:
         moving = held.moves_along
         if bool((moving | ~held.is_held).all()):
             return replace(held, first=None, last=None, rests=NO, shown=None)
-        last = seen if held.last is None else choose(live, seen, held.last)
+        last = choose(live, seen, held.last)
         return replace(held, first=first, last=last, rests=rests & ~moving, shown=shown)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
-        """A state with an object as a link: free for some robots, held by others."""
+        """Return a state with an object as a link: free for some robots, held by others."""
         assert held.grasp is not None
         links = self.kinematics.links
         if not held.carrier.ndim and bool(held.is_held):
@@ -491,7 +491,7 @@ class Holding:
         return state.with_link(name, None, held.last, rests) if bool(rests.any()) else state
 
 
-def _restarted(late: Tensor | None, where: Tensor) -> Tensor | None:
+def _restart_lag(late: Tensor | None, where: Tensor) -> Tensor | None:
     """Late joints that begin with the next reading: an object that rested is not late."""
     return late if late is None else late.masked_fill(where.unsqueeze(-1), math.nan)
 
@@ -502,19 +502,19 @@ def _constant(like: Frame, value: float) -> Frame:
 
 
 def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
-    """The seen pose; the known one where that is exactly an earlier one."""
+    """Return the seen pose; the known one where that is exactly an earlier one."""
     if stale is None or seen is known:
         return seen
     return choose(_same(seen, stale), known, seen)
 
 
 def _same(one: Frame, other: Frame) -> Tensor:
-    """Where poses are exactly the same."""
+    """Check which poses are exactly the same."""
     same = (one.position == other.position).all(-1)
     return same & (one.orientation == other.orientation).all(-1)
 
 
-def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
+def choose(where: Tensor, one: Frame, other: Frame | None) -> Frame:
     """One pose for some robots, the other for the rest.
 
     Parameters
@@ -522,7 +522,10 @@ def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
     where : Tensor of bool, of shape () or (...)
         For which robots the first.
     one, other : Frame
+        There may be no other yet: then the first is for all.
     """
+    if other is None:
+        return one
     if not where.ndim:
         return one if bool(where) else other
     mask = where[..., None]
@@ -531,7 +534,7 @@ def choose(where: Tensor, one: Frame, other: Frame) -> Frame:
 
 
 def between(one: Frame, other: Frame, share: Tensor) -> Frame:
-    """A pose between two others.
+    """Return a pose between two others.
 
     Parameters
     ----------

@@ -23,8 +23,9 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import PART
 from tpgmm_torch.skills.holding import Holding
-from tpgmm_torch.skills.situations import completed_situations, with_novelty
+from tpgmm_torch.skills.situations import complete_situations, with_novelty
 from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = ["Tick", "open_loop", "reproduce", "sample"]
 
@@ -56,15 +57,15 @@ def reproduce(
     DataError, ShapeError, UnknownNameError, PlausibilityError
         If a situation does not fit the skill, or cannot be what it is taken for.
     """
-    known = completed_situations(skill, situations)
+    known = complete_situations(skill, situations)
     trajectories: dict[int, Trajectory] = {}
     for members in _groups(known):
         batch = [known[index] for index in members]
         together = _run_together(skill, batch, candidates, ticks or open_loop)
         trajectories.update(zip(members, together, strict=True))
     done = [trajectories[index] for index in range(len(known))]
-    if hasattr(skill, "missed"):
-        skill.missed(known, done).act()
+    if isinstance(skill, ViaPoints):
+        skill.report_misses(known, done).act()
     return with_novelty(skill, known, done)
 
 
@@ -83,7 +84,7 @@ def open_loop(
         [s].
     """
     moving = {name for name, pose in poses.items() if len(pose.batch_shape) >= start.ndim}
-    here = {name: pose[0] if name in moving else pose for name, pose in poses.items()}
+    here = _poses_at(0, poses, moving)
     holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, here)
     skill, joints, last = skill.start(start, here), start, None
     done, inferring = list[Tick](), torch.is_inference_mode_enabled()
@@ -91,11 +92,11 @@ def open_loop(
         if now == last:
             done.append(done[-1])
             continue
-        seen = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
+        seen = _poses_at(k, poses, moving) if moving else None
         time = start.new_tensor(now)
         # what the first step does not record, none does; to ask so takes a third
         with torch.inference_mode(inferring or (k > 0 and not done[0][0].requires_grad)):
-            holding = holding.advance(time, joints, seen if moving else None)
+            holding = holding.advance(time, joints, seen)
             state: Any = joints
             if holding.carries:
                 state = holding.state(skill.kinematics.state(joints))
@@ -104,6 +105,11 @@ def open_loop(
         done.append((joints, found, holding))
         last = now
     return done
+
+
+def _poses_at(k: int, poses: Mapping[str, Frame], moving: set[str]) -> dict[str, Frame]:
+    """Select the poses at an instant, where they move."""
+    return {name: pose[k] if name in moving else pose for name, pose in poses.items()}
 
 
 def sample(
@@ -155,7 +161,7 @@ def _run_together(
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
     assert time is not None  # they are complete
-    frames = _stacked(situations)
+    frames = _stack_frames(situations)
     start = torch.stack([situation.joints for situation in situations])
     joints, poses = start, frames
     if len(situations) == 1:  # one robot is computed faster without a batch
@@ -168,7 +174,7 @@ def _run_together(
     whole = _over_time(estimates, shape)
     joints = torch.stack(references).view(shape)
     own: list[Candidate] = []
-    if candidates and hasattr(skill, "candidates"):
+    if candidates:
         states = torch.cat((start[None], joints[:-1]))
         own = _candidates(skill, held, states, frames, holdings, whole)
     names = skill.kinematics.joint_names
@@ -178,7 +184,7 @@ def _run_together(
     ]
 
 
-def _stacked(situations: Sequence[Situation]) -> dict[str, Frame]:
+def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
     """Frames of B situations, (B,) or, if they move, (T, B)."""
     return {
         name: Frame.stack([situation.frames[name] for situation in situations])
@@ -204,7 +210,7 @@ def _row(candidates: Sequence[Candidate], row: int) -> tuple[Candidate, ...]:
 
 
 def _candidates(
-    skill: Any,
+    skill: Skill,
     time: torch.Tensor,
     joints: torch.Tensor,
     frames: Mapping[str, Frame],

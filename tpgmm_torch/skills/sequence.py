@@ -107,7 +107,7 @@ class Sequence(CompositeSkill):
     def parse(
         cls, text: str, skills: Mapping[str, Skill] | Callable[[str], Skill], **options: Any
     ) -> Self:
-        """A sequence from one line of text.
+        """Return a sequence from one line of text.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class Sequence(CompositeSkill):
 
     @cached_property
     def _separate(self) -> tuple[bool, ...]:
-        """Which of the skills but the first do not share the clock of the one before."""
+        """Those of the skills but the first that do not share the clock of the one before."""
         pairs = pairwise(self.skills)
         return tuple(not _shares_clock(one, other, self.fade) for one, other in pairs)
 
@@ -182,7 +182,7 @@ class Sequence(CompositeSkill):
         return torch.cat(grids).unique()
 
     def time_of(self, index: int, time: Tensor) -> Tensor:
-        """A time of the sequence, on the clock of one of its skills."""
+        """Return a time of the sequence, on the clock of one of its skills."""
         one, by = self.skills[index], self._shifts[index]
         before, after = (False, *self._separate, False)[index : index + 2]
         if not (before or after):
@@ -239,7 +239,7 @@ class Sequence(CompositeSkill):
 
     @property
     def summary(self) -> TrainingSummary | None:
-        """Of the first skill, with those objects that only later ones know."""
+        """Summary of the first skill, with those objects that only later ones know."""
         first = self.skills[0].summary
         if first is None:
             return None
@@ -264,15 +264,15 @@ class Sequence(CompositeSkill):
         one = passed.new_ones(*passed.shape[:-1], 1)
         return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
 
-    def observed(self, names: frozenset[str]) -> Skill | None:
-        """See :meth:`Skill.observed`."""
-        several = [one.observed(names) for one in self.skills]
+    def restrict_to(self, names: frozenset[str]) -> Skill | None:
+        """See :meth:`Skill.restrict_to`."""
+        several = [one.restrict_to(names) for one in self.skills]
         known = tuple(one for one in several if one is not None)
         return self.with_skills(known) if len(known) == len(several) else None
 
 
 def _shares_clock(one: Skill, other: Skill, fade: float) -> bool:
-    """Whether a skill begins where the other ends, and not where that begins."""
+    """Check that a skill begins where the other ends, and not where that begins."""
     return abs(other.begin - one.end) <= min(fade, (one.end - one.begin) / 2)
 
 
@@ -296,7 +296,7 @@ def _held_on(holds: list[Hold], new: Hold) -> list[Hold]:
 
 
 def _are_parts(skills: tuple[Skill, ...], fade: float) -> bool:
-    """Whether all skills share one clock, of one robot."""
+    """Check that all skills share one clock, of one robot."""
     for one, other in pairwise(skills):
         if one.kinematics.joint_names != other.kinematics.joint_names:
             raise DataError("the skills of a sequence are of different robots")
@@ -310,7 +310,7 @@ def _are_parts(skills: tuple[Skill, ...], fade: float) -> bool:
 
 
 def _of_each(what: str, value: Any, count: int) -> Any:
-    """A value of each skill."""
+    """Return a value of each skill."""
     several = value if isinstance(value, tuple | list) else [value] * count
     if len(several) != count:
         raise DataError(f"{what} has {len(several)} entries for {count} skills: {value!r}")
@@ -341,7 +341,7 @@ def _check_condition(one: Any, skill: Skill) -> None:
 
 
 def _retry(names: tuple[str, ...], number: int, given: Any) -> tuple[int, int]:
-    """How often a skill is tried again, and from which one on."""
+    """Read how often a skill is tried again, and from which one on."""
     times, back = given if isinstance(given, tuple | list) else (given, number)
     if isinstance(back, str):
         if back not in names:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import check_situations
-from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
@@ -21,17 +20,15 @@ from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
     "at_first",
-    "completed_frames",
-    "completed_situations",
+    "complete_frames",
+    "complete_situations",
     "report_start",
     "tick_inputs",
     "with_novelty",
 ]
 
 
-def completed_frames(
-    skill: Skill, joints: Any, frames: Mapping[str, Frame]
-) -> dict[str, Frame]:
+def complete_frames(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     """Frames, and those that are not given but follow from the start posture.
 
     Parameters
@@ -47,7 +44,7 @@ def completed_frames(
         If a frame that the skill needs is missing, or has the name of a link.
     """
     complete, start = dict(frames), skill.kinematics.joint_tensor(joints)
-    for summary in _summaries(skill):
+    for summary in skill.summaries:
         complete |= summary.start_frames(start, skill.kinematics, complete)
     for name in skill.frame_names:
         if name not in complete:
@@ -59,7 +56,7 @@ def completed_frames(
     return complete
 
 
-def completed_situations(
+def complete_situations(
     skill: Skill, given: Situation | Demonstration | Iterable[Situation | Demonstration]
 ) -> list[Situation]:
     """Situations in the robot's joint order, with all frames and a time grid, and reported.
@@ -74,25 +71,27 @@ def completed_situations(
     DataError, ShapeError, UnknownNameError, PlausibilityError
         If one does not fit the skill, or cannot be what it is taken for.
     """
-    if not isinstance(given, Situation | Demonstration | Iterable):
+    if isinstance(given, Situation | Demonstration):
+        given = [given]
+    if not isinstance(given, Iterable):
         raise DataError(f"situations are a list of Situation, got {type(given).__name__}")
-    several = [given] if isinstance(given, Situation | Demonstration) else list(given)
-    situations = [_completed(skill, one) for one in several]
+    situations = [_complete(skill, one) for one in given]
     if situations:
-        firsts = [at_first(one) for one in situations]
-        report = check_situations(
-            torch.stack([one.joints for one in situations]),
-            {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]},
-            torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
-            skill.kinematics,
-            _span(skill),
-            _summaries(skill),
-        )
-        report.act()
+        _report(skill, situations)
     return situations
 
 
-def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
+def _report(skill: Skill, situations: Sequence[Situation]) -> None:
+    """Compare complete situations with the demonstrations."""
+    firsts = [at_first(one) for one in situations]
+    times = [one.time[[0, -1]] for one in situations if one.time is not None]
+    joints = torch.stack([one.joints for one in situations])
+    frames = {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]}
+    now = torch.stack(times), skill.kinematics, _span(skill), skill.summaries
+    check_situations(joints, frames, *now).act()
+
+
+def _complete(skill: Skill, given: Situation | Demonstration) -> Situation:
     names, like = skill.kinematics.joint_names, skill.kinematics.lower
     if isinstance(given, Demonstration):
         given = Situation.of(given)
@@ -104,7 +103,7 @@ def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
             f"the start posture has {len(given.joints)} joints, the model has {len(names)}: "
             f"{names}"
         )
-    complete = completed_frames(skill, given.joints, given.frames)
+    complete = complete_frames(skill, given.joints, given.frames)
     time = skill.time if given.time is None else given.time.to(like)
     present = {**complete, **given.frames_at(time)}
     frames = {name: present[name].to(like) for name in skill.frame_names}
@@ -133,7 +132,7 @@ def report_start(
     span = _span(skill)
     known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
     now = span[0] if time is None else time
-    check_situations(start, known, now, skill.kinematics, span, _summaries(skill)).act()
+    check_situations(start, known, now, skill.kinematics, span, skill.summaries).act()
 
 
 def tick_inputs(
@@ -162,12 +161,6 @@ def tick_inputs(
     return as_tensor(time, "time").to(kinematics.lower), state, here
 
 
-def _summaries(skill: Skill) -> list[TrainingSummary]:
-    """Summary of the demonstrations of a skill, or of each of its ways until one is chosen."""
-    ways = getattr(skill, "skills", ()) if skill.summary is None else ()
-    return [one.summary for one in (skill, *ways) if one.summary is not None]
-
-
 def _span(skill: Skill) -> Tensor:
     """Begin and end of a skill [s]."""
     return torch.tensor([skill.begin, skill.end], dtype=torch.float64)
@@ -183,7 +176,7 @@ def with_novelty(
     skill : Skill
     situations, trajectories : sequence of Situation, sequence of Trajectory
     """
-    summaries = _summaries(skill)
+    summaries = skill.summaries
     if not summaries:
         return list(trajectories)
     found = []

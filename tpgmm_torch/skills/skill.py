@@ -13,6 +13,7 @@ from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators.wrench import ExpectedForce
 from tpgmm_torch.regression.estimate import Estimate
@@ -87,6 +88,11 @@ class Skill(Protocol):
         """Distance of a situation from the demonstrations; None if that is not known."""
         return None
 
+    @property
+    def summaries(self) -> tuple[TrainingSummary, ...]:
+        """Those of which one is of the situation: several, until a way is chosen."""
+        return () if self.summary is None else (self.summary,)
+
     def estimate(
         self,
         time: Tensor,
@@ -94,7 +100,7 @@ class Skill(Protocol):
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
-        """Gaussian of the joints at a time, given the state q_{t-1} and the objects' poses.
+        """Estimate the joints at a time, given the state q_{t-1} and the objects' poses.
 
         Parameters
         ----------
@@ -114,8 +120,22 @@ class Skill(Protocol):
         """
         ...
 
+    def candidates(
+        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+    ) -> tuple[Candidate, ...]:
+        """Estimate the joints by each operator alone; none by default.
+
+        Parameters
+        ----------
+        time, state, frames
+            As for :meth:`estimate`.
+        estimate : Estimate
+            That it made of them.
+        """
+        return ()
+
     def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
-        """Forces that links exert at a time; none by default.
+        """Expect forces that links exert at a time; none by default.
 
         Parameters
         ----------
@@ -151,8 +171,8 @@ class Skill(Protocol):
         """
         ...
 
-    def observed(self, names: frozenset[str]) -> Skill | None:
-        """The skill of those operators whose frames and links are observed.
+    def restrict_to(self, names: frozenset[str]) -> Skill | None:
+        """Return the skill of those operators whose frames and links are observed.
 
         Parameters
         ----------
@@ -171,7 +191,7 @@ class Skill(Protocol):
         return None
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
-        """The skill for robots that begin with these postures and objects.
+        """Return the skill for robots that begin with these postures and objects.
 
         Parameters
         ----------
@@ -181,7 +201,7 @@ class Skill(Protocol):
         return self
 
     def of_robots(self, robots: Tensor) -> Skill:
-        """The skill for some robots of the batch.
+        """Return the skill for some robots of the batch.
 
         Parameters
         ----------
@@ -190,7 +210,7 @@ class Skill(Protocol):
         return self
 
     def advance(self, estimate: Estimate) -> Skill:
-        """The skill for the next tick, with what it remembers of its last estimate.
+        """Return the skill for the next tick, with what it remembers of its last estimate.
 
         Parameters
         ----------
@@ -212,19 +232,63 @@ class CompositeSkill(Skill):
     skills : tuple of Skill
     """
 
-    skills: tuple[Any, ...]
+    skills: tuple[Skill, ...]
+
+    @property
+    def representative(self) -> Skill:
+        """The skill whose holds, gates, bounds and demonstrations stand for all."""
+        return self.skills[0]
 
     @property
     def kinematics(self) -> Kinematics:
         """See :attr:`Skill.kinematics`."""
-        kinematics: Kinematics = self.skills[0].kinematics
-        return kinematics
+        return self.skills[0].kinematics
 
     @property
     def begin(self) -> float:
         """See :attr:`Skill.begin`."""
-        begin: float = self.skills[0].begin
-        return begin
+        return self.skills[0].begin
+
+    @property
+    def end(self) -> float:
+        """See :attr:`Skill.end`."""
+        return self.skills[0].end
+
+    @property
+    def time(self) -> Tensor:
+        """See :attr:`Skill.time`."""
+        return self.skills[0].time
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """See :attr:`Skill.holds`."""
+        return self.representative.holds
+
+    @property
+    def gates(self) -> tuple[Gate, ...]:
+        """See :attr:`Skill.gates`."""
+        return self.representative.gates
+
+    @property
+    def motion_bounds(self) -> MotionBounds | None:
+        """See :attr:`Skill.motion_bounds`."""
+        return self.representative.motion_bounds
+
+    @property
+    def peaks(self) -> tuple[Tensor, Tensor] | None:
+        """See :attr:`Skill.peaks`."""
+        return self.representative.peaks
+
+    @property
+    def summary(self) -> TrainingSummary | None:
+        """See :attr:`Skill.summary`."""
+        return self.representative.summary
+
+    @property
+    def summaries(self) -> tuple[TrainingSummary, ...]:
+        """See :attr:`Skill.summaries`."""
+        known = super().summaries
+        return known or tuple(found for one in self.skills for found in one.summaries)
 
     @property
     def frame_names(self) -> tuple[str, ...]:
@@ -237,19 +301,19 @@ class CompositeSkill(Skill):
         return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
 
     def shares(self, time: Tensor) -> Tensor:
-        """Weights (..., n_skills) of the skills at times of shape (...), or of robots."""
+        """Return the weights (..., n_skills) of the skills at times (...), or of robots."""
         raise NotImplementedError
 
     def leading(self, times: Tensor) -> Tensor:
-        """Which skill has the largest share at times (T,), of shape (T,) or (..., 1)."""
+        """Return the skill with the largest share at times (T,), as (T,) or (..., 1)."""
         return self.shares(times).argmax(-1)
 
     def time_of(self, index: int, time: Tensor) -> Tensor:
-        """A time of this skill, on the clock of one of its skills."""
+        """Return a time of this skill on the clock of one of its skills."""
         return time
 
-    def with_skills(self, skills: Iterable[Any]) -> Self:
-        """The same of other skills, if they are others."""
+    def with_skills(self, skills: Iterable[Skill]) -> Self:
+        """Replace the skills, if they are others."""
         others = tuple(skills)
         if all(one is other for one, other in zip(self.skills, others, strict=True)):
             return self
@@ -301,7 +365,7 @@ class CompositeSkill(Skill):
         for k, skill in enumerate(self.skills):
             weight = shares[..., k]
             for one in skill.expected_forces(self.time_of(k, time)):
-                part = one.scaled(weight)
+                part = one.scale(weight)
                 before = found.get(one.operator)
                 found[one.operator] = part if before is None else before.plus(part)
         return tuple(found.values())

@@ -65,7 +65,7 @@ class ViaPoint:
 
     time: float
     operator: Operator
-    value: tuple[float, ...] | tuple[tuple[str, float], ...]
+    value: tuple[float, ...] | Mapping[str, float]
     tolerance: float | tuple[float, ...] = 0.0
 
     def __init__(
@@ -79,39 +79,24 @@ class ViaPoint:
             operator = parse_operator(operator)
         if not isinstance(operator, Operator):
             raise DataError(f"a via-point is of an operator, got {type(operator).__name__}")
-        named = isinstance(value, Mapping)
-        if named and type(operator) is not Canonical:
-            raise DataError(
-                "values by name are of joints, ViaPoint(time, 'canonical', {...}); the "
-                f"operator is {format_operator(operator)}"
-            )
-        if isinstance(value, Frame):
-            value = torch.cat((value.position, value.orientation), -1)
-        numbers = as_tensor(
-            list(value.values()) if named else value, "the value of a via-point"
-        )
         widths = as_tensor(tolerance, "the tolerance of a via-point")
-        if numbers.ndim != 1 or not len(numbers):
-            raise ShapeError(
-                f"the value of a via-point has shape (D,), got {tuple(numbers.shape)}"
-            )
         if not math.isfinite(float(time)) or not bool((widths >= 0).all()):
             raise DataError(
                 "a via-point has a finite time and no negative tolerance, got "
                 f"time={time}, tolerance={tolerance}"
             )
-        object.__setattr__(self, "time", float(time))
-        object.__setattr__(self, "operator", operator)
-        pairs = (
-            zip(map(str, value), numbers.tolist(), strict=True) if named else numbers.tolist()
-        )
-        object.__setattr__(self, "value", tuple(pairs))
-        listed = widths.tolist()
-        object.__setattr__(self, "tolerance", tuple(listed) if widths.ndim else listed)
+        width = widths.tolist()
+        for name, given in {
+            "time": float(time),
+            "operator": operator,
+            "value": _read_value(operator, value),
+            "tolerance": tuple(width) if widths.ndim else width,
+        }.items():
+            object.__setattr__(self, name, given)
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The via-point that a text stands for, ``TIME:OPERATOR=NUMBERS~TOLERANCE``.
+        """Read a via-point from text, ``TIME:OPERATOR=NUMBERS~TOLERANCE``.
 
         Parameters
         ----------
@@ -141,33 +126,38 @@ class ViaPoint:
         return cls(time, match["what"].strip(), value, widths)
 
     def __str__(self) -> str:
-        parts = [f"{v[0]}:{v[1]!r}" if isinstance(v, tuple) else repr(v) for v in self.value]
-        given = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
-        tolerance = "" if given == (0.0,) else "~" + ",".join(map(repr, given))
-        return f"{self.time!r}:{format_operator(self.operator)}={','.join(parts)}{tolerance}"
+        if isinstance(self.value, Mapping):
+            value = ",".join(f"{name}:{number!r}" for name, number in self.value.items())
+        else:
+            value = ",".join(map(repr, self.value))
+        widths = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
+        tolerance = "" if widths == (0.0,) else "~" + ",".join(map(repr, widths))
+        return f"{self.time!r}:{format_operator(self.operator)}={value}{tolerance}"
 
-    def coordinates(self, kinematics: Kinematics) -> Tensor:
-        """The coordinates asked for, (D,), NaN for joints that are not named.
+    def coordinates(self, kinematics: Kinematics) -> tuple[Tensor, list[int] | None]:
+        """Compute the operator's coordinates (D,), and the joints asked for if not all.
 
         Parameters
         ----------
         kinematics : Kinematics
+            The robot, whose joints a value may name; those it does not name are 0.
 
         Raises
         ------
         DataError, ShapeError, UnknownNameError
             If they are not those of the operator, or the norm of a quaternion is not 1.
         """
-        like, size = kinematics.lower, self.operator.dimension(kinematics)
-        if isinstance(self.value[0], tuple):
-            wanted = like.new_full((size,), torch.nan)
-            for name, number in dict(self.value).items():  # type: ignore[arg-type]
-                if name not in kinematics.joint_names:
-                    known = kinematics.joint_names
-                    raise UnknownNameError("joint", name, "the model", known)
-                wanted[kinematics.joint_names.index(name)] = number
-        else:
-            wanted = torch.tensor(self.value, dtype=like.dtype, device=like.device)
+        like, size, value = kinematics.lower, self.operator.dimension(kinematics), self.value
+        if isinstance(value, Mapping):
+            names = kinematics.joint_names
+            for name in value:
+                if name not in names:
+                    raise UnknownNameError("joint", name, "the model", names)
+            wanted, rows = like.new_zeros(size), sorted(map(names.index, value))
+            for name, number in value.items():
+                wanted[names.index(name)] = number
+            return wanted, rows
+        wanted = torch.tensor(value, dtype=like.dtype, device=like.device)
         if len(wanted) != size:
             raise ShapeError(
                 f"the via-point {self} has {len(wanted)} numbers, but "
@@ -182,15 +172,15 @@ class ViaPoint:
                     "not 1"
                 )
             wanted[part] = quaternions.normalize(wanted[part])
-        return wanted
+        return wanted, None
 
     def variances(self, n_displacements: int) -> list[float]:
-        """Of what is asked for, one for each displacement.
+        """Return the variance of each displacement that is asked for.
 
         Parameters
         ----------
         n_displacements : int
-            Of the operator.
+            How many the operator has.
 
         Raises
         ------
@@ -205,3 +195,20 @@ class ViaPoint:
                 f"{format_operator(self.operator)} has {n_displacements} displacements"
             )
         return [width**2 for width in widths]
+
+
+def _read_value(operator: Operator, value: Any) -> tuple[float, ...] | dict[str, float]:
+    """Check what is given as a value: a frame, joints by name, or all coordinates."""
+    named = isinstance(value, Mapping)
+    if named and type(operator) is not Canonical:
+        raise DataError(
+            "values by name are of joints, ViaPoint(time, 'canonical', {...}); the operator is "
+            f"{format_operator(operator)}"
+        )
+    if isinstance(value, Frame):
+        value = torch.cat((value.position, value.orientation), -1)
+    numbers = as_tensor(list(value.values()) if named else value, "the value of a via-point")
+    if numbers.ndim != 1 or not len(numbers):
+        raise ShapeError(f"the value of a via-point has shape (D,), got {tuple(numbers.shape)}")
+    found = numbers.tolist()
+    return dict(zip(map(str, value), found, strict=True)) if named else tuple(found)

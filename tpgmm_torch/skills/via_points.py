@@ -3,36 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
+import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.trajectories import Trajectory
+from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import RobotState
-from tpgmm_torch.skills.conditioning import Conditioning
-from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.conditioning import Cluster, Request, Surroundings
+from tpgmm_torch.skills.skill import CompositeSkill, Skill
 from tpgmm_torch.skills.via_point import ViaPoint
 
 __all__ = ["ViaPoints"]
 
+#: What is further away than this, and than three times the tolerance, is missed [m, rad].
+MISSED = 1e-3
 
-class ViaPoints:
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What via-points know from tick to tick.
+
+    Parameters
+    ----------
+    clusters : tuple of Cluster
+        What is asked for, by times.
+    moved : tuple of Tensor of shape (..., A n_joints)
+        ``e_a`` of each cluster at the last tick; None where it did not count.
+    shift : Tensor of shape (..., n_joints), optional
+        ``e_t`` of the last tick; None where nothing was moved.
+    """
+
+    clusters: tuple[Cluster, ...] = ()
+    moved: tuple[Tensor | None, ...] = ()
+    shift: Tensor | None = None
+
+
+NOTHING = Memory()
+
+
+@dataclass(frozen=True, eq=False)
+class ViaPoints(CompositeSkill):
     """A skill conditioned on via-points; at other times it is the skill itself.
 
     Parameters
     ----------
     skill : Skill
-    points : iterable of ViaPoint or str
+        What is conditioned.
+    points : sequence of ViaPoint or str
         Between begin and end of the skill; text is for :meth:`ViaPoint.parse`.
     fade : float, default=1.0
         For how long before and after a via-point the skill is changed [s].
+    memory : Memory, optional
+        Of the last tick; made when it is left out.
 
     Raises
     ------
@@ -40,35 +71,48 @@ class ViaPoints:
         If a via-point does not fit the skill.
     """
 
-    def __init__(self, skill: Any, points: Iterable[ViaPoint | str], fade: float = 1.0) -> None:
-        given = [ViaPoint.parse(one) if isinstance(one, str) else one for one in points]
-        for point in given:
-            if not isinstance(point, ViaPoint):
-                raise DataError(f"via-points are ViaPoint objects, got {type(point).__name__}")
-            if not skill.begin <= point.time <= skill.end:
-                raise DataError(
-                    f"the via-point {point} is at {point.time:g} s, but the skill lasts from "
-                    f"{skill.begin:g} to {skill.end:g} s"
-                )
-            references, kinematics = point.operator.references(), skill.kinematics
-            point.operator.check(kinematics, references)
-            if strangers := set(point.operator.links()) - set(kinematics.links):
-                raise UnknownNameError("link", strangers.pop(), "the robot", kinematics.links)
-        self.skill, self.points, self.fade = skill, tuple(given), float(fade)
-        self.conditioning = Conditioning.of(skill, self.points, self.fade)
+    skill: Skill
+    points: Sequence[Any]
+    fade: float = 1.0
+    memory: Memory = field(default=NOTHING, repr=False, metadata={"saved": False})
+
+    def __post_init__(self) -> None:
+        if self.memory is not NOTHING:
+            return
+        points = [ViaPoint.parse(p) if isinstance(p, str) else p for p in self.points]
+        for point in points:
+            _check(point, self.skill)
+        if not self.fade > 0:
+            raise DataError(f"via-points fade over a positive time, got {self.fade} s")
+        clusters = Cluster.group(points, self.skill.kinematics, self.fade)
+        for name, value in {
+            "points": tuple(points),
+            "fade": float(self.fade),
+            "memory": Memory(clusters, (None,) * len(clusters)),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def skills(self) -> tuple[Skill]:  # type: ignore[override]
+        """The skill alone."""
+        return (self.skill,)
 
     @property
     def frame_names(self) -> tuple[str, ...]:
         """Frames of the skill and of the via-points."""
-        links = self.skill.kinematics.links
+        links = self.kinematics.links
         asked = [name for one in self.points for name in one.operator.references()]
         names = [*self.skill.frame_names, *(name for name in asked if name not in links)]
         return tuple(dict.fromkeys(names))
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "skill":
-            raise AttributeError(name)
-        return getattr(self.skill, name)
+    def shares(self, time: Tensor) -> Tensor:
+        """Return 1 at times (...): there is one skill."""
+        return torch.ones_like(time).unsqueeze(-1)
+
+    def with_skills(self, skills: Iterable[Skill]) -> Self:
+        """Replace the skill; see :meth:`CompositeSkill.with_skills`."""
+        [skill] = skills
+        return self if skill is self.skill else replace(self, skill=skill)
 
     def estimate(
         self,
@@ -77,50 +121,62 @@ class ViaPoints:
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
-        """The skill's estimate, given the via-points; see :meth:`Skill.estimate`."""
-        joints = state.joints if isinstance(state, RobotState) else state
-        shift = self.conditioning.shift
-        if shift is not None and shift.shape != joints.shape:
-            shift = None  # of other robots than those of the last tick
-        free = joints if shift is None else joints - shift
+        """Estimate the skill, given the via-points; see :meth:`Skill.estimate`."""
+        joints, held = (state, None) if isinstance(state, Tensor) else (state.joints, state)
+        clusters, shift = self.memory.clusters, self.memory.shift
+        if shift is not None and shift.shape == joints.shape:
+            joints = joints - shift  # of other robots than those of the last tick: none
+        around = Surroundings(self.skill, frames, held if held and held.carriers else None)
+        free = around.estimate(time, joints, bounds)
+        skill = self.skill.advance(free)
+        if not any(cluster.counts(time) for cluster in clusters):
+            memory = Memory(clusters, (None,) * len(clusters))
+            return replace(free, after=replace(self, skill=skill, memory=memory))
+        if not bool(free.joints.isfinite().all()):  # of whom it cannot be told: as it was
+            kept = free.joints if self.memory.shift is None else free.joints + self.memory.shift
+            return replace(free, joints=kept, after=replace(self, skill=skill))
+        given, memory = self._condition(time, free, around)
+        after = replace(self, skill=skill, memory=memory)
+        return replace(keep_within(given, bounds), after=after)
 
-        def attach(bare: RobotState) -> RobotState:
-            """Objects that the robots hold move with their links."""
-            assert isinstance(state, RobotState)
-            return _attached(bare, state)
+    def _condition(
+        self, time: Tensor, free: Estimate, around: Surroundings
+    ) -> tuple[Estimate, Memory]:
+        """Condition an estimate on all clusters."""
+        here, moved = around.estimate(time, free.joints), list[Tensor | None]()
+        shift, covariance = torch.zeros_like(here.joints), here.covariance
+        for cluster, last in zip(self.memory.clusters, self.memory.moved, strict=True):
+            there = None
+            if cluster.counts(time):
+                more, narrowed, there = cluster.condition(time, here, around, last)
+                shift, covariance = shift + more, covariance - narrowed
+            moved.append(there)
+        given = replace(free, joints=here.joints + shift, covariance=covariance)
+        return given, Memory(self.memory.clusters, tuple(moved), shift)
 
-        holds = attach if isinstance(state, RobotState) and state.carriers else None
-        given: Tensor | RobotState = free
-        if holds is not None:
-            given = holds(self.skill.kinematics.state(free))
-        unconditioned = self.skill.estimate(time, given, frames, bounds)
-        estimate, after = self.conditioning.advance(time, unconditioned, frames, bounds, holds)
-        mean, covariance, activation = estimate.joints, estimate.covariance, estimate.activation
-        own = unconditioned.candidates
-        skill = self.skill.advance(unconditioned)
-        remembers = self._with(skill, replace(after, regression=skill))
-        return Estimate(mean, covariance, activation, own, remembers)
+    def candidates(
+        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+    ) -> tuple[Candidate, ...]:
+        """Return those of the skill; see :meth:`Skill.candidates`."""
+        return self.skill.candidates(time, state, frames, estimate)
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
-        """Conditioned on the same points; see :meth:`Skill.start`."""
-        return ViaPoints(self.skill.start(joints, frames), self.points, self.fade)
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+        """Condition on the same points; see :meth:`Skill.start`."""
+        return type(self)(self.skill.start(joints, frames), self.points, self.fade)
 
-    def of_robots(self, robots: Tensor) -> Skill:
-        """See :meth:`Skill.of_robots`."""
-        skill = self.skill.of_robots(robots)
-        return self._with(skill, self.conditioning.of_robots(skill, robots))
+    def of_robots(self, robots: Tensor) -> Self:
+        """Keep some of the robots; see :meth:`Skill.of_robots`."""
+        some, shift = super().of_robots(robots), self.memory.shift
+        if shift is None or shift.ndim == 1:
+            return some
+        moved = tuple(None if one is None else one[robots] for one in self.memory.moved)
+        return replace(some, memory=Memory(self.memory.clusters, moved, shift[robots]))
 
-    def advance(self, estimate: Estimate) -> Skill:
-        """Go on from the last conditioned estimate; see :meth:`Skill.advance`."""
-        after: Skill | None = estimate.after
-        return self if after is None else after
+    def posture_search(self) -> PostureSearch | None:
+        """Return the skill's search where no via-point counts, which it would undo."""
+        return None if self.memory.shift is not None else self.skill.posture_search()
 
-    def _with(self, skill: Any, conditioning: Conditioning) -> ViaPoints:
-        other = object.__new__(type(self))
-        vars(other).update(vars(self), skill=skill, conditioning=conditioning)
-        return other
-
-    def missed(
+    def report_misses(
         self, situations: Sequence[Situation], trajectories: Sequence[Trajectory]
     ) -> Report:
         """Report the via-points that trajectories do not pass through.
@@ -128,6 +184,7 @@ class ViaPoints:
         Parameters
         ----------
         situations : sequence of Situation
+            In which the skill was reproduced.
         trajectories : sequence of Trajectory
             What was reproduced in each.
         """
@@ -141,31 +198,39 @@ class ViaPoints:
                 value=distance,
             )
             for n, (there, done) in enumerate(zip(situations, trajectories, strict=True))
-            for point, distance in self.conditioning.missed(
-                done.time, done.joints, there.frames
-            )
-            if not self.skill.holds  # a frame that is held is not where the situation has it
+            for point in self.points
+            if not self.holds  # a frame that is held is not where the situation has it
+            and (distance := self._miss(point, done, there.frames))
         ]
         if isinstance(self.skill, ViaPoints):
-            findings += self.skill.missed(situations, trajectories)
+            findings += self.skill.report_misses(situations, trajectories)
         return Report.of(findings, f"{len(situations)} situations with via-points")
 
-    def posture_search(self) -> PostureSearch | None:
-        """The skill's search where no via-point counts; see :meth:`Skill.posture_search`."""
-        # a search would undo what via-points ask for
-        return None if self.conditioning.shift is not None else self.skill.posture_search()
+    def _miss(
+        self, point: ViaPoint, done: Trajectory, frames: Mapping[str, Frame]
+    ) -> float | None:
+        """Measure by how much references miss a via-point [m, rad]; None if they do not."""
+        time = done.time
+        step = int((time - point.time).abs().argmin())
+        if not torch.isclose(time[step], time.new_tensor(point.time)):
+            return None  # between two steps
+        here = {n: f[step] if f.batch_shape else f for n, f in frames.items()}
+        request = Request.of(point, self.kinematics)
+        residual, _ = request.displacement(self.kinematics.state(done.joints[step]), here)
+        beyond = residual.abs() - 3 * request.variances.sqrt()
+        return float(residual.norm()) if float(beyond.max()) > MISSED else None
 
 
-def _attached(state: RobotState, like: RobotState) -> RobotState:
-    """A state of the robot alone with the objects of another state, in the same grasps."""
-    names = like.links[len(like.robot_links) :]
-    for name, carrier in zip(names, like.carriers, strict=True):
-        pose = like.pose(name)
-        state = state.with_link(name, None, pose)
-        each = [carrier] if isinstance(carrier, int) else carrier.unique().tolist()
-        for index in each:
-            if index >= 0:
-                grasp = pose.seen_from(like.pose(like.links[index]))
-                where = None if isinstance(carrier, int) else carrier == index
-                state = state.with_link(name, like.links[index], grasp, where)
-    return state
+def _check(point: object, skill: Skill) -> None:
+    """Refuse what is no via-point, or none of this skill."""
+    if not isinstance(point, ViaPoint):
+        raise DataError(f"via-points are ViaPoint objects, got {type(point).__name__}")
+    if not skill.begin <= point.time <= skill.end:
+        raise DataError(
+            f"the via-point {point} is at {point.time:g} s, but the skill lasts from "
+            f"{skill.begin:g} to {skill.end:g} s"
+        )
+    kinematics = skill.kinematics
+    point.operator.check(kinematics, point.operator.references())
+    if strangers := set(point.operator.links()) - set(kinematics.links):
+        raise UnknownNameError("link", strangers.pop(), "the robot", kinematics.links)

@@ -14,9 +14,7 @@ from torch import Tensor
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -111,39 +109,13 @@ class Ways(CompositeSkill):
             object.__setattr__(self, name, value)
 
     @property
-    def end(self) -> float:
-        """See :attr:`Skill.end`; ways that last longer or shorter are played in that time."""
-        return self.skills[0].end
-
-    @property
-    def time(self) -> Tensor:
-        """See :attr:`Skill.time`."""
-        time = self.skills[0].time
-        assert time is not None
-        return time
-
-    @property
-    def holds(self) -> tuple[Hold, ...]:
-        """See :attr:`Skill.holds`: those of the way of all robots, or of the first."""
-        return self._first.holds
-
-    @property
-    def motion_bounds(self) -> MotionBounds | None:
-        """See :attr:`Skill.motion_bounds`."""
-        return self._first.motion_bounds
-
-    @property
-    def peaks(self) -> tuple[Tensor, Tensor] | None:
-        """Accelerations and jerks of the demonstrations."""
-        return self._first.peaks
-
-    @property
     def summary(self) -> TrainingSummary | None:
-        """See :attr:`Skill.summary`."""
-        return None if self.chosen is None else self._first.summary
+        """See :attr:`Skill.summary`; None until the way is chosen."""
+        return None if self.chosen is None else self.representative.summary
 
     @property
-    def _first(self) -> Regression:
+    def representative(self) -> Regression:
+        """The way of all robots, or of the first."""
         return self.skills[0 if self.chosen is None else int(self.chosen.flatten()[0])]
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
@@ -167,7 +139,7 @@ class Ways(CompositeSkill):
         return replace(some, chosen=some.chosen[robots])
 
     def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
-        """The way for each robot, and why; each way is tried on a coarse grid of time.
+        """Return the way for each robot, and why; each way is tried on a coarse grid of time.
 
         Parameters
         ----------
@@ -195,7 +167,7 @@ class Ways(CompositeSkill):
         return [WayChoice(*part) for part in parts]
 
     def _misfit(self, way: int, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
-        """How much less likely a reproduction is than demonstrations were, (B,) [nats]."""
+        """Compute how much less likely a reproduction is than demonstrations, (B,) [nats]."""
         skill, worst = self.skills[way], torch.zeros(len(joints), dtype=torch.float64)
         bounds = skill.kinematics.lower, skill.kinematics.upper
         for now in torch.linspace(skill.begin, skill.end, INSTANTS).to(joints):
@@ -223,11 +195,11 @@ class Ways(CompositeSkill):
         return shares[ways.to(time.device)]
 
     def leading(self, times: Tensor) -> Tensor:
-        """The way of each robot, (..., 1): at all times the same."""
+        """Return the way of each robot, (..., 1): at all times the same."""
         return super().leading(times).unsqueeze(-1)
 
     def time_of(self, index: int, time: Tensor) -> Tensor:
-        """A time of the skill, on the clock of one of its ways."""
+        """Return a time of the skill, on the clock of one of its ways."""
         own = self.skills[index]
         share = (time - self.begin) / (self.end - self.begin)
         return own.begin + share * (own.end - own.begin)

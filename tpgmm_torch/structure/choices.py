@@ -29,7 +29,14 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "aligner", "learn", "operators_or_default", "parse_parts", "prepared"]
+__all__ = [
+    "Choices",
+    "aligner",
+    "learn",
+    "operators_or_default",
+    "parse_parts",
+    "prepare_demonstrations",
+]
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,7 @@ class Choices:
 def aligner(
     method: str, robot: Kinematics | None, features: Sequence[str] | None = None
 ) -> Alignment | Pipeline | None:
-    """The transformer of a name: :func:`parse_alignment`, or "parts", which finds them first.
+    """Make the transformer of a name: :func:`parse_alignment`, or "parts", found first.
 
     Parameters
     ----------
@@ -88,7 +95,7 @@ def aligner(
 def operators_or_default(
     given: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
 ) -> list[Operator]:
-    """The operators that are given, or all links seen from all frames, and the joints.
+    """Return the operators that are given, or all links seen from all frames, and the joints.
 
     Parameters
     ----------
@@ -108,16 +115,10 @@ def operators_or_default(
     PlausibilityWarning
         If links are seen from no object, though there are objects.
     """
-    links = () if robot is None else robot.links
     if given:
-        moving = [link for one in given for link in one.links()]
-        if frames and robot is not None and moving and not frame_names(given, robot):
-            warnings.warn(
-                f"none of the operators refers to the objects {list(frames)}: LINK@FRAME does",
-                PlausibilityWarning,
-                stacklevel=2,
-            )
+        _warn_of_unseen(given, robot, frames)
         return list(given)
+    links = () if robot is None else robot.links
     if frames and not links:
         model = getattr(robot, "model", None)
         what = f"of {list(model.links)}" if model else "with --robot (--policy.robot)"
@@ -129,7 +130,20 @@ def operators_or_default(
     return default_operators(links, frames)
 
 
-def prepared(
+def _warn_of_unseen(
+    operators: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
+) -> None:
+    """Warn if links are seen from no object, though there are objects."""
+    moving = any(one.links() for one in operators)
+    if frames and robot is not None and moving and not frame_names(operators, robot):
+        warnings.warn(
+            f"none of the operators refers to the objects {list(frames)}: LINK@FRAME does",
+            PlausibilityWarning,
+            stacklevel=3,
+        )
+
+
+def prepare_demonstrations(
     aligned: Sequence[Demonstration],
     operators: Sequence[Operator],
     robot: Kinematics | None,
@@ -164,7 +178,7 @@ def learn(
     model : TaskParameterizedGMM
         Unfitted.
     source : sequence of Demonstration, or iterable of batches
-        As :func:`prepared` gives them.
+        As :func:`prepare_demonstrations` gives them.
     choices : Choices
     processes : Processes
 
@@ -197,7 +211,7 @@ def learn(
 
 
 def parse_parts(text: str | None) -> str | list[float | str] | None:
-    """Where parts end, as ``--parts`` says it: "auto", or seconds and events.
+    """Read where parts end from ``--parts``: "auto", or seconds and events.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class Evidence:
     floor: Tensor
     degrees: float
 
-    def _fused(self, operators: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def _fuse(self, operators: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Covariance and mean (..., n, 1) of the product of some operators' Gaussians."""
         precision, vector = self.nothing
         for operator in operators:
@@ -69,13 +69,13 @@ class Evidence:
         return covariance, covariance @ vector[..., None]
 
     def log_likelihood(self, operators: Sequence[int]) -> Tensor:
-        """Of the demonstrations left out, given some operators by number, in nats, (M, T)."""
-        covariance, step = self._fused(operators)
+        """Compute that of those left out, given some operators by number, (M, T) [nats]."""
+        covariance, step = self._fuse(operators)
         floored, name = covariance + self.floor.diag(), "the covariance of what is expected"
         return gaussians.log_density(step, floored, name, self.degrees)[..., 0]
 
     def errors(self, operator: int, others: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """How far demonstrations left out are from what is expected, root mean square.
+        """Measure how far those left out are from what is expected, root mean square.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Evidence:
             From what the operator expects, and from what the others do, as far as the joints
             can tell: in metres, radians, or numbers of a quaternion.
         """
-        _, step = self._fused(others)
+        _, step = self._fuse(others)
         of_others = (self.jacobians[operator] @ step)[..., 0]
         own, other = (x.square().sum(-1).mean(0) for x in (self.residuals[operator], of_others))
         return own.sqrt(), other.sqrt()

@@ -55,7 +55,7 @@ def fit_parts(
     edges = _edges(known, cuts)
     stretches = list(pairwise(edges))
     if isinstance(operators, SelectOperators):
-        operators = [_selected(operators, known, *own) for own in stretches]
+        operators = [_select_for(operators, known, *own) for own in stretches]
     of_parts = [model.operators] * len(stretches) if operators is None else list(operators)
     if len(of_parts) != len(stretches):
         raise DataError(f"there are operators for {len(of_parts)} of {len(stretches)} parts")
@@ -81,16 +81,16 @@ def _edges(known: Sequence[Demonstration], cuts: Sequence[float | str]) -> list[
     return edges
 
 
-def _selected(
+def _select_for(
     select: SelectOperators, known: Sequence[Demonstration], begin: float, end: float
 ) -> tuple[Operator, ...]:
-    """The operators that matter from ``begin`` to ``end``."""
+    """Return the operators that matter from ``begin`` to ``end``."""
     part = [one.at_steps((one.time >= begin) & (one.time < end)) for one in known]
     return clone(select).fit(part).operators_
 
 
 def _times(cut: float | str, demonstrations: Sequence[Demonstration]) -> list[float]:
-    """The time of a cut, or the median times of the events that a pattern names."""
+    """Return the time of a cut, or the median times of the events that a pattern names."""
     if isinstance(cut, Real):
         return [float(cut)]
     known = demonstrations[0].events
@@ -103,7 +103,7 @@ def _times(cut: float | str, demonstrations: Sequence[Demonstration]) -> list[fl
 
 
 def _shares(number: int, durations: NDArray[np.float64]) -> list[int]:
-    """How many of the components each part has: one at least."""
+    """Divide the components among the parts: at least one each."""
     if number < len(durations):
         raise DataError(
             f"{len(durations)} parts need a component each, n_components is {number}: raise "

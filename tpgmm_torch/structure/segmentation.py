@@ -116,12 +116,12 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
         check_parameters(self)
         demonstrations = check_demonstrations(X)
         phases, reasons = self._candidates(demonstrations)
-        cuts = sorted(self._agreed(phases, reasons))
+        cuts = sorted(self._agree(phases, reasons))
         self.n_parts_ = 1 + len(cuts)
         self.progress_ = np.array([progress for progress, _, _ in cuts])
         self.reasons_ = tuple(reason for _, reason, _ in cuts)
         self.shares_ = np.array([share for _, _, share in cuts])
-        self.boundaries_ = self._placed(demonstrations, phases)
+        self.boundaries_ = self._place(demonstrations, phases)
         return self
 
     def transform(self, X: Sequence[Any]) -> list[Any]:
@@ -148,7 +148,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
             return list(X)
         demonstrations = check_demonstrations(X)
         phases, _ = self._candidates(demonstrations)
-        placed, named = self._placed(demonstrations, phases), []
+        placed, named = self._place(demonstrations, phases), []
         for one, times in zip(demonstrations, placed, strict=True):
             others = {k: at for k, at in one.events.items() if not k.startswith("part ")}
             parts = {f"part {number}": float(at) for number, at in enumerate(times, 2)}
@@ -156,7 +156,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
         return named
 
     def report(self) -> str:
-        """A table of the boundaries: when they are, why, and how many demonstrations say so."""
+        """Tabulate the boundaries: when they are, why, and how many demonstrations agree."""
         self._check_fitted("boundaries_")
         lines = [
             ("part", "begins at", "earliest", "latest", "found in", "because of"),
@@ -178,7 +178,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
     def _candidates(
         self, demonstrations: Sequence[Demonstration]
     ) -> tuple[list[Array], list[list[str]]]:
-        """Of each demonstration, where a part may end, as shares of its duration, and why."""
+        """Find where parts of each demonstration may end, as shares of it, and why."""
         found = [find_boundaries(one, self.robot) for one in demonstrations]
         phases = [
             np.array([(at.time - float(one.time[0])) / one.duration for at in own])
@@ -186,12 +186,12 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
         ]
         return phases, [[at.reason for at in own] for own in found]
 
-    def _agreed(
+    def _agree(
         self, phases: Sequence[Array], reasons: Sequence[Sequence[str]]
     ) -> list[tuple[float, str, float]]:
         """Progress, reason and share of the boundaries that most demonstrations have."""
         table = [
-            np.array([_matched(one, other, self.shift) for other in phases]) for one in phases
+            np.array([_match(one, other, self.shift) for other in phases]) for one in phases
         ]
         # of the demonstration most like the others: what these lack counts as what they have
         matches = max(table, key=lambda row: 2 * np.sum(row >= 0) - row.size)
@@ -207,13 +207,11 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
                 cuts.append((progress, reason, float(shares[i])))
         return cuts
 
-    def _placed(
-        self, demonstrations: Sequence[Demonstration], phases: Sequence[Array]
-    ) -> Array:
+    def _place(self, demonstrations: Sequence[Demonstration], phases: Sequence[Array]) -> Array:
         """When the boundaries are in demonstrations, (M, B), given what may be some in each."""
         rows = np.empty((len(demonstrations), len(self.progress_)))
         for row, one, own in zip(rows, demonstrations, phases, strict=True):
-            match = _matched(self.progress_, own, self.shift)
+            match = _match(self.progress_, own, self.shift)
             there = match >= 0
             known = np.concatenate(([0.0], self.progress_[there], [1.0]))
             here = np.concatenate(([0.0], own[match[there]], [1.0]))
@@ -222,7 +220,7 @@ class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[mi
         return rows
 
 
-def _matched(one: Array, other: Array, shift: float) -> NDArray[np.int64]:
+def _match(one: Array, other: Array, shift: float) -> NDArray[np.int64]:
     """For each instant of one, (A,), which of the other (B,) it is, -1 where there is none.
 
     Those are matched that leave the least sum of distances, in the order of both; one that is

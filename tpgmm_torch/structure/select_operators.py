@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, permutations
@@ -33,10 +33,7 @@ from tpgmm_torch.training.hold_detection import demonstrated_holds, with_holds
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
-__all__ = ["Judgement", "SelectOperators", "arranged", "candidate_operators"]
-
-POSITIONS = AbsolutePosition, RelativePosition
-ORIENTATIONS = AbsoluteOrientation, RelativeOrientation
+__all__ = ["Judgement", "SelectOperators", "arrange", "candidate_operators"]
 
 
 @dataclass(frozen=True)
@@ -207,17 +204,17 @@ class SelectOperators(DemonstrationEstimator):
             tolerance=self.tolerance, n_instants=self.n_instants, n_left_out=self.n_left_out,
             holds=holds,
         )  # fmt: skip
-        chosen = self._chosen(evidence, operators)
+        chosen = self._choose(evidence, operators)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
-        self.operators_ = arranged([operators[j] for j in chosen])
+        self.operators_ = arrange([operators[j] for j in chosen])
         judged = [self._judge(evidence, j, chosen, kinematics) for j in range(len(operators))]
         self.judgements_ = tuple(judgement for judgement, _ in judged)
         self.relevance_ = torch.stack([gains for _, gains in judged], -1).cpu().numpy()
         return self
 
     def report(self) -> str:
-        """A table of the candidates, those that gain most first: which were kept, and why."""
+        """Tabulate the candidates, those that gain most first: which were kept, and why."""
         self._check_fitted("support_")
         order = sorted(self.judgements_, key=lambda one: (not one.kept, -one.gain, -one.alone))
         lines: list[tuple[str, ...]] = [
@@ -237,44 +234,54 @@ class SelectOperators(DemonstrationEstimator):
             return "decides there" if matters else "decides what the others leave free"
         return "says what those kept say" if matters else "tells nothing of what was left out"
 
-    def _chosen(self, evidence: Evidence, operators: Sequence[Operator]) -> list[int]:
-        """Operators of joints, and those that gain most beside them, less what gains little."""
+    def _choose(self, evidence: Evidence, operators: Sequence[Operator]) -> list[int]:
+        """Add to the joints' operators those that gain most; drop what then gains little."""
 
         @cache
         def mean(*operators: int) -> float:
             return float(evidence.log_likelihood(operators).mean())
 
-        chosen = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
-        while rest := [j for j in range(len(operators)) if j not in chosen]:
+        chosen = _joints_of(operators)
+        rest = [j for j, one in enumerate(operators) if not one.is_posture]
+        while rest:
             best = max(rest, key=lambda j: mean(*chosen, j))
             if chosen and mean(*chosen, best) - mean(*chosen) <= self.threshold:
                 break
-            chosen.append(best)
+            chosen, rest = [*chosen, best], _without(rest, best)
+        return sorted(self._drop(chosen, operators, mean))
+
+    def _drop(
+        self,
+        chosen: list[int],
+        operators: Sequence[Operator],
+        mean: Callable[..., float],
+    ) -> list[int]:
+        """Drop operators, but for those of all joints, that gain little beside the others."""
         free = [j for j in chosen if not operators[j].determines_joints]
         while len(chosen) > 1 and free:
             least = max(free, key=lambda j: mean(*_without(chosen, j)))
             if mean(*chosen) - mean(*_without(chosen, least)) > self.threshold:
                 break
             chosen, free = _without(chosen, least), _without(free, least)
-        return sorted(chosen)
+        return chosen
 
     def _judge(
         self, evidence: Evidence, j: int, chosen: Sequence[int], kinematics: Kinematics
     ) -> tuple[Judgement, Tensor]:
-        """Gain of candidate j, when it counts, its own units; and its gains (T,)."""
+        """Judge candidate j; also return its gains (T,)."""
         operator, others = self.candidates_[j], _without(chosen, j)
-        joints = [i for i, one in enumerate(self.candidates_) if isinstance(one, Canonical)]
+        joints = _joints_of(self.candidates_)
         base = [] if j in joints else joints
 
-        def gained(beside: Sequence[int]) -> Tensor:
+        def gain(beside: Sequence[int]) -> Tensor:
             with_it = evidence.log_likelihood([*beside, j])
             return (with_it - evidence.log_likelihood(beside)).mean(0)
 
-        gains = gained(others)
+        gains = gain(others)
         peak = int(gains.argmax())
         factor, unit = _unit(operator, evidence.jacobians[j].shape[-2], kinematics)
         error, of_others = (float(each[peak]) * factor for each in evidence.errors(j, others))
-        numbers = float(gains.mean()), float(gained(base).mean()), float(evidence.time[peak])
+        numbers = float(gains.mean()), float(gain(base).mean()), float(evidence.time[peak])
         judgement = Judgement(operator, j in chosen, *numbers, error, of_others, unit)
         return judgement, gains
 
@@ -282,7 +289,7 @@ class SelectOperators(DemonstrationEstimator):
 def candidate_operators(
     kinematics: Kinematics | None, demonstration: Demonstration
 ) -> list[Operator]:
-    """Operators that :class:`SelectOperators` chooses from where nothing is named.
+    """List the operators that :class:`SelectOperators` chooses from where nothing is named.
 
     Parameters
     ----------
@@ -303,35 +310,45 @@ def candidate_operators(
     position:hand
     position:hand@cup
     """
-    candidates: list[Operator] = [Canonical()]
     links = () if kinematics is None else kinematics.links
     turns = getattr(kinematics, "orientation", True)  # tracked points have none
-    for link in links:
-        candidates += [AbsolutePosition(link), AbsoluteOrientation(link)][: 1 + turns]
-    frames = list(demonstration.frames)
     # what is held is a thing of its own, to be brought to a place
     held = list(dict.fromkeys(hold.frame for hold in demonstration.holds or ()))
+    poses: list[Operator] = []
+    for link in links:
+        poses += AbsolutePosition(link), AbsoluteOrientation(link)
+    for pair in _pairs(demonstration, links, held):
+        poses += RelativePosition(*pair), RelativeOrientation(*pair)
+    for pair in permutations(held, 2):  # each in a hand of its own
+        poses += RelativePosition(*pair, held=True), RelativeOrientation(*pair, held=True)
+    return [Canonical(), *(poses if turns else poses[::2])]
+
+
+def _pairs(
+    demonstration: Demonstration, links: Sequence[str], held: Sequence[str]
+) -> list[tuple[str, str]]:
+    """List what is seen from where: links from frames and links, held objects from frames."""
+    frames = demonstration.frames
     pairs = [(link, frame) for frame in frames for link in links]
     pairs += [(link, other) for other, link in combinations(links, 2)]
-    pairs += [(thing, frame) for thing in held for frame in frames if frame != thing]
-    for pair in pairs:
-        candidates += [RelativePosition(*pair), RelativeOrientation(*pair)][: 1 + turns]
-    for pair in permutations(held, 2):  # each in a hand of its own
-        both = [RelativePosition(*pair, held=True), RelativeOrientation(*pair, held=True)]
-        candidates += both[: 1 + turns]
-    return candidates
+    return pairs + [(thing, frame) for thing in held for frame in frames if frame != thing]
+
+
+def _joints_of(operators: Sequence[Operator]) -> list[int]:
+    """List the operators of joints, by number."""
+    return [j for j, one in enumerate(operators) if one.is_posture]
 
 
 def _without(chosen: Sequence[int], dropped: int) -> list[int]:
     return [j for j in chosen if j != dropped]
 
 
-def arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """Of some ``operators``, what refers to one place stacked, joints behind it."""
+def arrange(operators: Sequence[Operator]) -> tuple[Operator, ...]:
+    """Stack those ``operators`` that refer to one place, and put joints behind them."""
     groups: dict[Any, list[Operator]] = {}
     joints = []
     for operator in operators:
-        if isinstance(operator, Canonical):
+        if operator.is_posture:
             joints.append(operator)
         else:
             place = operator.references(), operator.links()[1:]
@@ -341,13 +358,12 @@ def arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
 
 
 def _unit(operator: Operator, rows: int, kinematics: Kinematics) -> tuple[float, str]:
-    """Factors from the rows of an operator's Jacobian to its unit."""
-    if isinstance(operator, POSITIONS):
+    """Return factor and unit for the rows of an operator's Jacobian."""
+    units = {*operator.units(kinematics)}
+    if units == {"m"}:
         return 1e3, "mm"
-    if isinstance(operator, ORIENTATIONS):  # a quaternion's four, or a rotation vector's three
+    if operator.quaternion_starts(kinematics) == (0,) and len(operator.units(kinematics)) == 4:
         return (2.0 if rows == 4 else 1.0) * 180 / np.pi, "deg"
-    if isinstance(operator, Canonical) and len(kinematics.lengths) == kinematics.n_joints:
-        return 1e3, "mm"
-    if isinstance(operator, Canonical) and not kinematics.lengths:
+    if "rad" in units and "m" not in units:
         return 180 / np.pi, "deg"
     return 1.0, ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any, Self
@@ -46,8 +46,14 @@ class _View:
     near: float
 
     def of(self, members: NDArray[np.intp]) -> _View:
-        """The same of some of the demonstrations."""
+        """Return the same of some of the demonstrations."""
         return replace(self, values=self.values[members])
+
+    def places(self) -> Iterator[tuple[_View, int, Array]]:
+        """List stretches, and coordinates (N,) of the demonstrations on each axis there."""
+        for stretch, means in enumerate(self.stretches.swapaxes(0, 1)):
+            for along in _axes(means):
+                yield self, stretch, along
 
     @property
     def stretches(self) -> Array:
@@ -204,7 +210,7 @@ class SelectWays(DemonstrationEstimator):
         return self
 
     def report(self) -> str:
-        """How many modes there are and why, as text.
+        """Report how many modes there are and why, as text.
 
         Raises
         ------
@@ -261,29 +267,21 @@ class SelectWays(DemonstrationEstimator):
             self.labels_[members] = mode
 
     def _split(self, views: Sequence[_View]) -> _Split | None:
-        """The best division of some demonstrations; None if BIC says that they are one mode."""
+        """Divide some demonstrations best; None if BIC says that they are one mode."""
         most = min(self._given or self.max_ways, len(views[0].values) // FEWEST)
         if most < 2:
             return None
-        places = [
-            (view, stretch, along)
-            for view in views
-            for stretch, means in enumerate(view.stretches.swapaxes(0, 1))
-            for along in _axes(means)
-        ]
+        places = [place for view in views for place in view.places()]
         cost = math.log(max(len(places), 1))
-        splits = [_divided(*place, cost, most, self._given) for place in places]
+        splits = [_divide_along(*place, cost, most, self._given) for place in places]
         best = sorted(filter(None, splits), key=lambda split: split.worth)
         if self._given:
             return next(iter(best), None)
-        return next((one for one in best if not self._explained(one, views)), None)
+        found = (s for s in best if not self._is_shift(s) and not _is_situation(s, views))
+        return next(found, None)
 
-    def _explained(self, split: _Split, views: Sequence[_View]) -> bool:
-        """Whether a shift in time explains a division, or what is seen at the start."""
-        return self._late(split) or _situational(split, views)
-
-    def _late(self, split: _Split) -> bool:
-        """Whether there is no gap between modes, or none but for who is a little earlier."""
+    def _is_shift(self, split: _Split) -> bool:
+        """Check whether modes differ by a shift in time: in a little while they meet."""
         values, labels = split.view.values, split.labels
         edges = _edges(values.shape[1])
         now = (edges[split.stretch] + edges[split.stretch + 1]) // 2
@@ -298,10 +296,10 @@ class SelectWays(DemonstrationEstimator):
         return bool(shifted[~same].min() <= max(nearest.max(), split.view.near))
 
 
-def _divided(
+def _divide_along(
     view: _View, stretch: int, along: Array, cost: float, most: int, given: int | None
 ) -> _Split | None:
-    """The best division along one axis of one stretch, if there is more than one mode."""
+    """Divide along one axis of one stretch; None if there is one mode."""
     partitions = _partitions(along, most)
     scores = np.array([_log_likelihood(along, labels, view.near) for labels in partitions])
     k = np.arange(1, most + 1)
@@ -315,7 +313,7 @@ def _divided(
 
 
 def _edges(count: int) -> NDArray[np.intp]:
-    """Where stretches of T instants begin and end."""
+    """Divide T instants into stretches: return their edges."""
     number = min(STRETCHES, count)
     return np.linspace(0, count, number + 1).round().astype(np.intp)
 
@@ -363,7 +361,7 @@ def _scatter(values: Array, labels: NDArray[np.intp]) -> tuple[Array, float]:
 
 
 def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Of numbers and their labels under modes of one variance of at least ``near^2``.
+    """Compute the log-likelihood of numbers under modes of one variance, at least ``near^2``.
 
     It is the restricted one: means are integrated out, from a prior as wide as all numbers,
     because K means of few numbers take much of what tells the variance.
@@ -385,8 +383,8 @@ def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
     return float(np.diff(np.sort(means)).min() / within)
 
 
-def _situational(split: _Split, views: Sequence[_View]) -> bool:
-    """Whether where demonstrations begin, as some operator sees it, shows the modes too."""
+def _is_situation(split: _Split, views: Sequence[_View]) -> bool:
+    """Check whether beginnings, as some operator sees them, show the modes too."""
     one = np.zeros_like(split.labels)
     gains = [
         _log_likelihood(along, split.labels, view.near) - _log_likelihood(along, one, view.near)
@@ -397,7 +395,7 @@ def _situational(split: _Split, views: Sequence[_View]) -> bool:
 
 
 def _largest_surprise(skill: Regression, demonstrations: Sequence[Demonstration]) -> float:
-    """The largest surprise of the demonstrations that a skill was learned from [nats]."""
+    """Compute the largest surprise of the demonstrations that a skill learned from [nats]."""
     motions = [Motion.of(one, skill.kinematics, skill.holds) for one in demonstrations]
     return max(
         float(skill.surprise(one.time, one.state.joints, one.frames).max()) for one in motions

@@ -15,8 +15,8 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Canonical, Operator, Wrench
-from tpgmm_torch.operators.base import of_joints
-from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
+from tpgmm_torch.operators.base import leaves, of_joints
+from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.robots.kinematics import JointSpace, Kinematics
 
 __all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]

@@ -18,8 +18,8 @@ from torch import Tensor
 from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.operators import Canonical, Operator
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import attach_holds
@@ -186,7 +186,7 @@ def comparable_coordinates(
             if not bool((spread > 0).any()):
                 continue
             # of joints, each has a unit of its own
-            if leaf.determines_joints or isinstance(leaf, Canonical):
+            if leaf.determines_joints or leaf.is_posture:
                 local = local[..., spread > 0] / spread[spread > 0].clamp(min=least)
                 yield leaf, local, NEAR * local.shape[-1] ** 0.5
             else:

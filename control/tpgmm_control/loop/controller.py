@@ -81,7 +81,7 @@ from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.holding import Holding
-from tpgmm_torch.skills.situations import completed_frames, report_start
+from tpgmm_torch.skills.situations import complete_frames, report_start
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]
@@ -210,7 +210,7 @@ class Controller:
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
         kinematics = skill.kinematics
         start = kinematics.joint_tensor(joints)
-        frames = completed_frames(skill, joints, frames or {})
+        frames = complete_frames(skill, joints, frames or {})
         if trust is not None:
             report_start(skill, joints, frames)
         self._frames = self._first_frames = _converted(kinematics, frames)
@@ -492,7 +492,7 @@ class Controller:
         if robots.any():
             self._fade = self._fade.again(self._tensor(robots))
             if self._search is not None:
-                self._search = self._search.ended(self._tensor(robots))
+                self._search = self._search.drop_robots(self._tensor(robots))
 
     def _find(self, row: int, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""

@@ -147,7 +147,7 @@ class HoldWatch:
         for name, not_held in free_yet.items():
             rest = self.rests.get(name)
             if rest is not None and rest.found and not bool(not_held.all()):
-                holding = holding.ungiven(name, ~not_held)
+                holding = holding.clear_override(name, ~not_held)
         return holding
 
     def _seen(
@@ -200,7 +200,7 @@ class HoldWatch:
             for index, grasp in enumerate(grasps):
                 where = held & (holder == index)
                 if bool(where.any()):
-                    holding = holding.taken(name, index, where, rest.pose, grasp)
+                    holding = holding.take(name, index, where, rest.pose, grasp)
                     found = True
         share = torch.where(settles, settled, elsewhere.to(moved))
         stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
@@ -217,7 +217,7 @@ class HoldWatch:
         yet: Tensor,
     ) -> tuple[Rest, Holding]:
         """Let go objects that are far from where their links would have them."""
-        carried = holding.carried(name, self.kinematics.state(joints))
+        carried = holding.locate(name, self.kinematics.state(joints))
         far = ~holding.free(name, rest.away) & yet
         far = far & (carried.change(rest.seen, LOST, LOST_TURN) >= 1)
         away = torch.where(due, torch.where(far, rest.away + rest.since, 0.0), rest.away)
@@ -316,8 +316,8 @@ class Holds:
         return replace(new, hidden=new._hidden(joints, lost, inputs, dt))
 
     def restarted(self, robots: Tensor, joints: Tensor) -> Self:
-        """For some robots a separate skill begins; see :meth:`Holding.restarted`."""
-        return replace(self, holding=self.holding.restarted(robots, joints))
+        """For some robots a separate skill begins; see :meth:`Holding.restart`."""
+        return replace(self, holding=self.holding.restart(robots, joints))
 
     def released(self, robots: Tensor, joints: Tensor, seen: Mapping[str, Frame]) -> Self:
         """Some robots do something again: they hold nothing, and objects are where they are.
@@ -340,7 +340,7 @@ class Holds:
             )
             for name, rest in self.watch.rests.items()
         }
-        holding = self.holding.released(robots, seen)
+        holding = self.holding.release(robots, seen)
         return replace(self, holding=holding, watch=replace(self.watch, rests=rests))
 
     def _hidden(

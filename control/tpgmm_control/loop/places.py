@@ -119,7 +119,7 @@ class Places:
             name: frame.expand(batch)[index] if frame.batch_shape else frame
             for name, frame in holding.frames.items()
         }
-        skill = self.skill.observed(frozenset((*frames, *state.links)))
+        skill = self.skill.restrict_to(frozenset((*frames, *state.links)))
         if skill is None:
             return None
         mask = torch.zeros(batch, dtype=torch.bool)

@@ -319,7 +319,7 @@ class Scene:
 
 def _summaries(skill: Any) -> Iterator[Any]:
     """Of the demonstrations of the skills that a skill is made of."""
-    parts = (*getattr(skill, "skills", ()), *filter(None, [getattr(skill, "skill", None)]))
+    parts = getattr(skill, "skills", ())
     for one in parts:
         yield from _summaries(one)
     if not parts:

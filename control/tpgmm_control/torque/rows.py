@@ -27,8 +27,7 @@ from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Canonical, Operator, PoseOperator, Stack
-from tpgmm_torch.operators.base import of_joints
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import leaves, of_joints
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Regression
@@ -171,7 +170,7 @@ class LocalGaussians:
     def __init__(self, skill: Regression, gains: TorqueGains) -> None:
         self.skill, self._kinematics, like = skill, skill.kinematics, skill.kinematics.lower
         with torch.inference_mode(False):
-            self._conditionals = Conditionals.stacked(skill.fused)
+            self._conditionals = Conditionals.stack(skill.scaled_conditionals)
         self._stack = Stack(*of_joints(skill.operators))
         self._starts = self._stack.quaternion_starts(skill.kinematics)
         noise, links = list[float](), dict[str, None]()

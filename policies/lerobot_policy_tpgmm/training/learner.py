@@ -29,7 +29,7 @@ from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.structure.choices import aligner, learn, prepared
+from tpgmm_torch.structure.choices import aligner, learn, prepare_demonstrations
 from tpgmm_torch.training.hold_detection import holding_as_in
 
 __all__ = ["Learner"]
@@ -202,7 +202,7 @@ class Learner:
         log.info("EM: fitting %s components", config.n_components)
         estimator = config.estimator(self._kinematics, list(self._operators))
         robust, holds = config.training.robust, config.given_holds()
-        shown = prepared(aligned, self._operators, estimator.robot, robust, holds)
+        shown = prepare_demonstrations(aligned, self._operators, estimator.robot, robust, holds)
         self.model, reports = learn(estimator, shown, config.choices())
         for report in reports:
             log.info("%s", report)

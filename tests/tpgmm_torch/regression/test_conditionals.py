@@ -51,7 +51,7 @@ def test_selecting_keeps_what_belongs_together():
 
 def test_a_stack_is_its_parts_side_by_side_at_any_time():
     parts = [conditionals_of(local(2, 3)), conditionals_of(local(3, 2))]
-    stack = Conditionals.stacked(parts)
+    stack = Conditionals.stack(parts)
     time = torch.tensor([0.0, 0.9], dtype=torch.float64)
     assert_close(stack.at(time), torch.cat([part.at(time) for part in parts], -1))
     for k in range(K):

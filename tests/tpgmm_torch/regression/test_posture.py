@@ -146,7 +146,7 @@ def test_a_search_that_ended_begins_where_the_robot_is():
     start = torch.stack((neutral(), neutral() + 0.05))
     _, search = searched(REACHED, start, 3)
     elsewhere = start - 0.2
-    one = search.ended(torch.tensor([True, False]))
+    one = search.drop_robots(torch.tensor([True, False]))
     assert one.active is not None and one.active.tolist() == [False, True]
     regression = small_bottle().skill
     estimate = regression.estimate(TIME, elsewhere, {"bottle": REACHED}, limits())
@@ -158,5 +158,5 @@ def test_a_search_that_ended_begins_where_the_robot_is():
     torch.testing.assert_close(steps[0][0], steps[1][0], rtol=0, atol=1e-12)
     torch.testing.assert_close(steps[0][1], steps[2][1], rtol=0, atol=1e-12)
     assert float((steps[0][0] - steps[2][0]).abs().max()) > 1e-3
-    assert search.ended(asked).active is None
-    assert search.begun().ended(asked).active is None
+    assert search.drop_robots(asked).active is None
+    assert search.reset().drop_robots(asked).active is None

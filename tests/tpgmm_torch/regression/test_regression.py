@@ -23,7 +23,7 @@ from tests.support.mixtures import (
 from tests.support.worlds import LEFT, OBJECT, RIGHT, OnRobot, upper_body
 from tpgmm_torch import AbsolutePosition, Canonical, Frame, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
@@ -242,7 +242,7 @@ def test_expected_coordinates_are_those_of_regression_in_the_local_space():
     problem = Problem.of(CASES["the paper's"], 4)
     grid, local = times(6), problem.mixtures[0]
     regression = problem.regression()
-    expected = regression.expected(0, grid)
+    expected = regression.expect(0, grid)
     for time, actual in zip(grid.tolist(), expected, strict=True):
         marginals = [
             w * oracles.normal(time, m[0], c[0, 0])

@@ -47,7 +47,7 @@ def dense(regression: Regression, joints, frames, instants) -> np.ndarray:
             mean, signs = one.at(now), torch.ones_like(one.mean)
             for start in operator.quaternion_starts(regression.kinematics):
                 block = slice(start, start + 4)  # flipped to the side of the present one
-                centre = one.recentred(first.time_mean)[:, block]
+                centre = one.recenter(first.time_mean)[:, block]
                 signs[:, block] = torch.sign((centre * local[block]).sum(-1, keepdim=True))
             covariance = signs[:, :, None] * one.covariance * signs[:, None, :]
             given = torch.distributions.MultivariateNormal(signs * mean, covariance)
@@ -117,7 +117,7 @@ def test_operators_without_their_frames_are_left_out():
     """The right hand seen from the left one needs no cup."""
     _, wanted = new_handling()
     regression, state = hands().skill, HANDS.state(wanted)
-    observed = regression.observed(frozenset(HANDS.links))
+    observed = regression.restrict_to(frozenset(HANDS.links))
     without = observed.log_likelihood(GRID, state, {}).numpy()
     alone = Regression(
         regression.kinematics,
@@ -130,11 +130,11 @@ def test_operators_without_their_frames_are_left_out():
     np.testing.assert_allclose(without, expected, rtol=1e-4, atol=0.02)
     assert np.ptp(without, 1).min() > 1
     cup = frozenset((*HANDS.links, "cup"))
-    assert regression.observed(cup) is regression
+    assert regression.restrict_to(cup) is regression
     only = replace(
         regression, operators=regression.operators[:1], conditionals=regression.conditionals[:1]
     )
-    assert only.observed(frozenset(HANDS.links)) is None
+    assert only.restrict_to(frozenset(HANDS.links)) is None
 
 
 def test_observations_that_are_not_finite_leave_every_time_alike():
@@ -162,7 +162,7 @@ def test_of_a_stack_the_observed_operators_are_kept():
     settings = {"n_components": 6, "robot": HANDS}
     model = TaskParameterizedGMM(operators=[both, Canonical()], **settings).fit(demonstrations)
     a, state = {"a": situation.frames["cup"]}, HANDS.state(wanted)
-    observed = model.skill.observed(frozenset((*HANDS.links, "a")))
+    observed = model.skill.restrict_to(frozenset((*HANDS.links, "a")))
     [first, canonical] = model.skill.conditionals
     columns = torch.tensor([0, 1, 2, 6, 7, 8])
     only = Stack(RelativePosition("left", "a"), RelativePosition("right", "a"))

@@ -30,7 +30,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import save
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.structure.choices import prepared
+from tpgmm_torch.structure.choices import prepare_demonstrations
 
 __all__ = [
     "GENERATED", "UPLOADED", "Skill", "learn", "move_objects", "page", "places_of", "show",
@@ -144,7 +144,7 @@ def _fit(
     check(read, robot).act()
     operators = default_operators(() if robot is None else robot.links, list(read[0].frames))
     model = TaskParameterizedGMM(n_components, operators, robot, random_state=0)
-    return model.fit(prepared(align(read, "dtw", robot), operators, robot))
+    return model.fit(prepare_demonstrations(align(read, "dtw", robot), operators, robot))
 
 
 def places_of(skill: Skill | None, number: int) -> list[list[Any]]:

@@ -200,7 +200,7 @@ def fit(
         first, fitted = _align(read, batched, alignment, robot)
         frames = list(first[0].frames)
         model.operators = structure.operators_or_default(operators, robot, frames)
-        kept = structure.prepared(first, model.operators, robot, robust, holds)
+        kept = structure.prepare_demonstrations(first, model.operators, robot, robust, holds)
         if processes.rank == 0:
             _echo(_sum_up_episodes(recording, read, kept))
             _echo(_sum_up_recording(recording, kept, described.link, not operator))

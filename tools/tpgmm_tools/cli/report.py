@@ -49,12 +49,12 @@ def report(
         Of more episodes, only this number is left out, one after the other.
     """
     from tpgmm_tools.report import write_report
-    from tpgmm_torch.structure.choices import prepared
+    from tpgmm_torch.structure.choices import prepare_demonstrations
 
     fitted = options.load_one_thread(model)
     robot = fitted.kinematics_
     shown = options.align(data.read(dataset, robot), alignment, robot)
-    shown = prepared(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
+    shown = prepare_demonstrations(shown, fitted.operators_, robot, holds=fitted.holds_ or None)
     options.check_situation(situation, len(shown))
     how = around.read(fitted.skill, shown) | {"situation": situation, "most": most}
     place = out or Path(f"{model}.html")

@@ -1,6 +1,8 @@
 """Densities over rotations are normalised, whatever coordinates they were learned in."""
 
 import math
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +16,18 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.regression.rotation_density import rotation_log_density
 from tpgmm_torch.robots import Poses
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 2, 40, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def rotation_log_density():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        return runpy.run_path(str(EXAMPLES / "orientation_geometry.py"))["rotation_log_density"]
 
 
 def recordings(spread):
@@ -38,7 +47,7 @@ def fitted(operator, spread):
 
 @pytest.mark.parametrize("geometry", ["quaternion", "tangent"])
 @pytest.mark.parametrize("spread", [0.2, 0.5])
-def test_the_density_is_normalised_over_rotations(geometry, spread):
+def test_the_density_is_normalised_over_rotations(geometry, spread, rotation_log_density):
     """Over SO(3), whose volume is 8 pi^2, at one instant, by uniform rotations."""
     regression = fitted(AbsoluteOrientation("hand", geometry=geometry), spread).skill
     rng = np.random.default_rng(0)
@@ -49,7 +58,7 @@ def test_the_density_is_normalised_over_rotations(geometry, spread):
     [operator] = regression.operators
     local = operator.at(now).coordinates(state, {})
     if geometry == "quaternion":
-        local = quaternions.match_hemisphere(local, regression.expected(0, now[None]))
+        local = quaternions.match_hemisphere(local, regression.expect(0, now[None]))
     time = now.expand(count)
     marginal = regression.marginals.log_activation(now[None]).logsumexp(-1)
     log_time = marginal - 0.5 * math.log(2 * math.pi)
@@ -64,7 +73,7 @@ def test_the_density_is_normalised_over_rotations(geometry, spread):
     assert total == pytest.approx(1.0, abs=0.1)  # of so many rotations it is known to 0.03
 
 
-def test_without_orientations_it_is_the_likelihood():
+def test_without_orientations_it_is_the_likelihood(rotation_log_density):
     shown = recordings(0.2)
     operator = RelativePosition("hand", "here")
     shown = [Demonstration(d.time, d.joints, {"here": Frame([0.0, 0.0, 0.0])}) for d in shown]
