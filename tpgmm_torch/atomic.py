@@ -11,8 +11,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["consistent", "contents", "open_whole", "read_whole", "recover", "replacing"]
-
 #: How a file begins that stands for one which Git LFS has not fetched.
 POINTER = b"version https://git-lfs.github.com/spec/"
 #: What file managers leave behind.

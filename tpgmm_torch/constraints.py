@@ -30,10 +30,6 @@ from sklearn.base import BaseEstimator
 
 from tpgmm_torch.exceptions import InvalidParameterError, NotFittedError
 
-__all__ = [
-    "ANYTHING", "DemonstrationEstimator", "Interval", "Options", "check_parameters",
-]  # fmt: skip
-
 #: Entry of a parameter that is checked elsewhere.
 ANYTHING: tuple[Any, ...] = (object,)
 

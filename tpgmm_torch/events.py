@@ -21,12 +21,6 @@ from tpgmm_torch.data.frames import LEVER, STILL
 from tpgmm_torch.data.pose_names import is_gripper, pose_groups, words
 from tpgmm_torch.training.hold_detection import find_holds
 
-__all__ = [
-    "LEAST_CONFIDENCE", "Boundary", "between_levels", "crossing_time", "find_boundaries",
-    "find_contacts", "find_gripper_changes", "find_stops", "gripper_groups",
-    "high_stretches", "level_changes", "move_start", "smooth_speed", "without_spikes",
-]  # fmt: skip
-
 #: Confidence, from 0 to 1, below which nothing is an event.
 LEAST_CONFIDENCE = 0.2
 #: Slower than this share of the peak speed is noise.

@@ -10,11 +10,21 @@ from sklearn.exceptions import ConvergenceWarning as SklearnConvergenceWarning
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 
 __all__ = [
-    "ConvergenceWarning", "DataError", "DegenerateComponentWarning", "DependencyError",
-    "DistributedError", "InvalidParameterError", "MissingLimitsWarning", "ModelFileError",
-    "NotFittedError", "PlausibilityError", "PlausibilityWarning", "ShapeError",
-    "TPGMMError", "UnknownNameError",
-]  # fmt: skip
+    "ConvergenceWarning",
+    "DataError",
+    "DegenerateComponentWarning",
+    "DependencyError",
+    "DistributedError",
+    "InvalidParameterError",
+    "MissingLimitsWarning",
+    "ModelFileError",
+    "NotFittedError",
+    "PlausibilityError",
+    "PlausibilityWarning",
+    "ShapeError",
+    "TPGMMError",
+    "UnknownNameError",
+]
 
 
 class TPGMMError(Exception):

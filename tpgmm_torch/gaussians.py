@@ -16,9 +16,14 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "block_diagonal", "cholesky", "common_shape", "condition", "from_information",
-    "information", "log_density", "moment_match", "product", "pseudo_inverse", "whiten",
-]  # fmt: skip
+    "condition",
+    "from_information",
+    "information",
+    "log_density",
+    "moment_match",
+    "product",
+    "whiten",
+]
 
 
 #: Up to this many numbers Python is faster than an operation of the library.

@@ -23,10 +23,7 @@ from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = [
-    "Instants", "PoseErrors", "PoseScorer", "joint_rmse", "largest_acceleration",
-    "largest_speeds", "largest_velocity", "pose_errors", "reproduction_scorer",
-]  # fmt: skip
+__all__ = ["PoseErrors", "PoseScorer", "joint_rmse", "pose_errors", "reproduction_scorer"]
 
 
 #: An event's name, or an instant or several [s].

@@ -47,7 +47,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save", "validate"]
+__all__ = ["load", "save"]
 
 #: Files of a model.
 FILES = CONFIG, TENSORS = "config.json", "model.safetensors"

@@ -22,11 +22,23 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 
 __all__ = [
-    "conjugate", "continuous", "exp", "from_matrix", "hemisphere_sign", "hemisphere_signs",
-    "identity", "interpolate", "inverse_left_jacobian", "left_jacobian", "left_matrix",
-    "log", "match_hemisphere", "mean", "normalize", "product", "quaternion_blocks",
-    "right_matrix", "rotate", "slerp", "to_matrix", "vector_matrix",
-]  # fmt: skip
+    "conjugate",
+    "continuous",
+    "exp",
+    "from_matrix",
+    "inverse_left_jacobian",
+    "left_matrix",
+    "log",
+    "match_hemisphere",
+    "mean",
+    "normalize",
+    "product",
+    "right_matrix",
+    "rotate",
+    "slerp",
+    "to_matrix",
+    "vector_matrix",
+]
 
 
 #: Which entry of q = (q_1, q_2, q_3, q_4) stands where in H+(q) of eq. (20), with its sign.

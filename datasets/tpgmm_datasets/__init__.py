@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 # here are quick to look up
 if TYPE_CHECKING:
     from tpgmm_datasets.checks.check import check
-    from tpgmm_datasets.checks.drop_outliers import drop_outliers
     from tpgmm_datasets.conversion.poses import FramePose, LinkPose
     from tpgmm_datasets.conversion.timing import resample, trim
     from tpgmm_datasets.description import DatasetInfo, describe_lerobot
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from tpgmm_datasets.reader import iter_lerobot, load_lerobot
     from tpgmm_datasets.units import Scale
     from tpgmm_datasets.writer import add_frames, save_lerobot
+    from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
 __all__ = [
     "CHECKS",
@@ -44,17 +44,17 @@ __all__ = [
 ]
 
 _HOMES = {
-    "checks.check": ("check",),
-    "checks.drop_outliers": ("drop_outliers",),
-    "conversion.poses": ("FramePose", "LinkPose"),
-    "conversion.timing": ("resample", "trim"),
-    "description": ("DatasetInfo", "describe_lerobot"),
-    "episode_batches": ("EpisodeBatches",),
-    "errors": ("CHECKS", "DatasetError", "DatasetWarning"),
-    "motors": ("MotorMap", "estimate_motor_map"),
-    "reader": ("iter_lerobot", "load_lerobot"),
-    "units": ("Scale",),
-    "writer": ("add_frames", "save_lerobot"),
+    ".checks.check": ("check",),
+    "tpgmm_torch.training.outlying_demonstrations": ("drop_outliers",),
+    ".conversion.poses": ("FramePose", "LinkPose"),
+    ".conversion.timing": ("resample", "trim"),
+    ".description": ("DatasetInfo", "describe_lerobot"),
+    ".episode_batches": ("EpisodeBatches",),
+    ".errors": ("CHECKS", "DatasetError", "DatasetWarning"),
+    ".motors": ("MotorMap", "estimate_motor_map"),
+    ".reader": ("iter_lerobot", "load_lerobot"),
+    ".units": ("Scale",),
+    ".writer": ("add_frames", "save_lerobot"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -64,7 +64,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        module = import_module(f"{__name__}.{_HOME[name]}")
+        module = import_module(_HOME[name], __name__)
     except ModuleNotFoundError as error:
         if error.name not in ("pandas", "pyarrow"):
             raise

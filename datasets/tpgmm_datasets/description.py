@@ -15,11 +15,10 @@ from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT, KNOWN, SEEN
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, CAMERAS, Feature, Layout, open_layout
-from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.units import guess_unit, with_pose_units
-from tpgmm_torch.data.pose_names import is_gripper
+from tpgmm_torch.data.pose_names import is_gripper, pose_groups
 
-__all__ = ["ColumnInfo", "DatasetInfo", "describe_lerobot"]
+__all__ = ["DatasetInfo", "describe_lerobot"]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "UnknownUnitsError", "list_problems"]
+__all__ = ["DatasetError", "DatasetWarning"]
 
 #: The checks that ``relax`` may name, with what each of them refuses.
 CHECKS = {

@@ -31,18 +31,7 @@ from tpgmm_torch.events import (
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = [
-    "Detection",
-    "Detector",
-    "ObjectMoves",
-    "SignalEvent",
-    "Stop",
-    "doubtful_events",
-    "find_events",
-    "gripper_signals",
-    "parse_event",
-    "usual_event",
-]
+__all__ = ["find_events", "parse_event"]
 
 #: A link rests below the first share of its peak speed, and moves above the second.
 REST, MOTION = 0.1, 0.3

@@ -5,8 +5,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["levenberg_marquardt"]
-
 
 def levenberg_marquardt(
     residual: Callable[[Tensor], tuple[Tensor, Tensor]],

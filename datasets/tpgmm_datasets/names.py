@@ -7,9 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_groups, words
-
-__all__ = ["POSE_PARTS", "match_names", "pose_groups", "quaternion_groups", "value_names"]
+from tpgmm_torch.data.pose_names import words
 
 #: Groups, name and position of a value.
 Leaf = tuple[tuple[str, ...], Any, Any]

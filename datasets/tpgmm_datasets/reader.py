@@ -39,7 +39,7 @@ from tpgmm_torch.data.demonstrations import Demonstration, check_robot
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
+__all__ = ["iter_lerobot", "load_lerobot"]
 
 #: What helps where values in a unit of their own are out of range.
 RAW = (

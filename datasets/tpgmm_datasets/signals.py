@@ -17,8 +17,6 @@ from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
 from tpgmm_datasets.units import Scale, add_offsets
 
-__all__ = ["CELL", "Signals"]
-
 #: The cell of a set whose objects were tracked.
 CELL = "meta/cell.json"
 REMEDY = "A policy observes each joint, and gives an action for it"

@@ -16,7 +16,6 @@ from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameEr
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["check_columns", "find_joints", "list_motion_columns"]
 
 EVENT, COVARIANCE, WRENCH = "event.", "covariance.", "wrench."
 #: The column that may be missing.

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 __all__ = [
     "demonstrations_from_frame",
     "demonstrations_to_frame",
-    "numbers",
     "read_table",
     "trajectories_to_frame",
     "write_table",

@@ -11,8 +11,6 @@ from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]
-
 NAME = re.compile(r"[^@\[\]]+")
 #: ``FEATURE``, ``FEATURE[7:14]``, ``LINK@EVENT`` or ``LINK@EVENT+x,y,z``; and a table's file.
 SOURCE = re.compile(r"([^=@\[\]]+)(?:@[^=@\[\]]+|\[(\d+):(\d+)\])?|.+\.(?:csv|parquet)")

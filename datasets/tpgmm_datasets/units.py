@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from tpgmm_datasets.errors import DatasetError, UnknownUnitsError
-from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.pose_names import is_gripper
+from tpgmm_torch.data.pose_names import is_gripper, pose_groups
 
-__all__ = ["Scale", "Unit", "Units"]
+__all__ = ["Scale"]
 
 
 @dataclass(frozen=True)

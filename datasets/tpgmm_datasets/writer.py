@@ -43,7 +43,7 @@ from tpgmm_datasets.lerobot.statistics import (
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
-__all__ = ["Column", "add_frames", "open_to_copy", "save_lerobot"]
+__all__ = ["add_frames", "save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_env_bimanual.rendering import Renderer
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["Array", "Observation", "StateEnv", "finite_vector"]
-
 Array = NDArray[np.float64]
 #: Arrays of numbers; ``pixels`` are pictures by the names of cameras.
 Observation = dict[str, Any]

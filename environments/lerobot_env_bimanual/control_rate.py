@@ -11,8 +11,6 @@ from typing import Any
 import torch
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
 
-__all__ = ["CONTROL_RATE", "rate_processors"]
-
 #: Key of the rate in an observation [1/s].
 CONTROL_RATE = "observation.control_fps"
 

@@ -30,8 +30,6 @@ from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["ControlledEnv"]
-
 #: Standard deviations of the sensors at ``noise=1``: joints [rad], the objects' positions [m]
 #: and orientations [rad].
 NOISE_JOINTS = 2e-3

@@ -20,11 +20,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = [
-    "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
-    "Live", "Misplaced", "Moved", "NoisyPose", "PoseLost", "Sagging", "Spoilt",
-    "StartedMidway", "Stopped", "displace_pose", "generators", "parse_condition",
-]  # fmt: skip
+__all__ = ["parse_condition"]
 
 Vector = NDArray[np.float64]
 Rng = np.random.Generator

@@ -42,10 +42,7 @@ from tpgmm_datasets.bottle.skill import HANDS, BottleShaking
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
-__all__ = [
-    "CALIBRATION", "EXPERTS", "Expert", "demonstrate_forces", "expert", "main", "record",
-    "record_calibration",
-]  # fmt: skip
+__all__ = ["record"]
 
 #: Time steps per second of the experts' motions, whatever the rate of the set.
 RATE = 100.0

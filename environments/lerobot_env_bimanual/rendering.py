@@ -24,7 +24,6 @@ except ModuleNotFoundError as error:
         "the simulated robots need MuJoCo: pip install lerobot_env_bimanual"
     ) from error
 
-__all__ = ["Renderer", "offscreen"]
 
 #: What is shown where nothing can be drawn.
 BLANK = (16, 16, 3)

@@ -14,25 +14,6 @@ from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError
 
-__all__ = [
-    "BOX",
-    "CAMERA",
-    "CYLINDER",
-    "DAMPING",
-    "PALM",
-    "PALM_SIZE",
-    "STIFFNESS",
-    "TABLE",
-    "TIMESTEP",
-    "RobotScene",
-    "add_geom",
-    "add_position_control",
-    "add_table",
-    "add_view",
-    "add_weld",
-    "robot_spec",
-]  # fmt: skip
-
 #: Of the simulation and of the position control of the joints [s].
 TIMESTEP = 1e-3
 #: Gains of the position control [N m / rad, N m s / rad].

@@ -12,8 +12,6 @@ from lerobot_env_bimanual.base import Array, finite_vector
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Start"]
-
 #: From a reference to the motors [ms]: a field bus and the cycles of some controllers.
 DELAY = (1, 8)
 #: A push's beginning, in a skill of 13 s, and length [s], and its torque [N m], which stays

@@ -22,8 +22,6 @@ from tpgmm_evaluation.policies.elapsed_time import tell_time
 from tpgmm_evaluation.policies.episodes import Episodes, Windows, policy_stride
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["RECIPES", "Recipe", "Training", "train"]
-
 #: A column that varies less than this over the training set is constant: dividing by its
 #: spread would blow up rounding errors [rad, m].
 CONSTANT = 1e-4

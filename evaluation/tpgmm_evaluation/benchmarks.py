@@ -37,9 +37,6 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics
 
-__all__ = ["BENCHMARKS", "OTHER_ROBOTS", "Benchmark", "benchmark"]
-
-
 #: How hard the robot moved, as the report shows it.
 PEAKS = {
     "peak_speed": Figure("peak speed [rad/s]", 1),

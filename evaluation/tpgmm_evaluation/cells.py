@@ -15,8 +15,6 @@ from tpgmm_evaluation.variants import Variant
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Cell", "Results", "parse_numbers", "write_json"]
-
 
 @dataclass(frozen=True, order=True)
 class Cell:

@@ -11,8 +11,6 @@ import typer
 
 from tpgmm_tools.arguments import options
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 EXAMPLES = """tpgmm compare --env suite --demonstrations 3,10 --policies quick --episodes 10

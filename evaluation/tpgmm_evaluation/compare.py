@@ -19,7 +19,7 @@ from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.variants import NAMED, Variant
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["ALL_CONDITIONS", "Comparison", "choose_conditions", "compare", "rewrite_report"]
+__all__ = ["compare"]
 
 #: Stands for every condition that an environment has.
 ALL_CONDITIONS = "all"

@@ -22,8 +22,6 @@ from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.trainings import TRAININGS
 from tpgmm_torch.atomic import replacing
 
-__all__ = ["POLICIES", "record", "run"]
-
 #: In the order of the report.
 POLICIES = tuple(TRAININGS)
 RECORD = "training.json"

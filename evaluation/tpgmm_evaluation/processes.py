@@ -11,8 +11,6 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
-__all__ = ["run_jobs"]
-
 #: Loaded once, in the process from which all jobs fork.
 PRELOADED = "tpgmm_evaluation.jobs"
 

@@ -23,8 +23,6 @@ from lerobot.scripts.lerobot_eval import rollout
 from tpgmm_evaluation.policies.replay import NearestPolicy
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 
-__all__ = ["Runner", "evaluate", "latency"]
-
 #: Policies of this package, which LeRobot does not find by the type of a configuration.
 BASELINES: dict[str, Any] = {
     kind.name: kind for kind in (KeyPosesPolicy, MeanPolicy, NearestPolicy)

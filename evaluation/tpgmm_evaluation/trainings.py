@@ -29,8 +29,6 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.select_operators import SelectOperators
 
-__all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
-
 #: TP-GMM with one of its parts removed, or with its operators chosen by itself.
 ABLATIONS = ("tpgmm-places", "tpgmm-position-only", "tpgmm-no-joints", "tpgmm-auto")
 

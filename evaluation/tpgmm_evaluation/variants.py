@@ -10,8 +10,6 @@ from typing import Self
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["EVEN_CLOCK", "NAMED", "OPEN_LOOP", "Variant"]
-
 #: What 0.1.0 does by default: play the skill by the clock, with what is seen at the start.
 OPEN_LOOP = "tpgmm-open-loop"
 #: Sees and follows everything, but goes by the clock, however far the skill has come.

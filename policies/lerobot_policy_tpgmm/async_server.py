@@ -21,8 +21,6 @@ from lerobot.async_inference.policy_server import serve
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["main"]
-
 #: Addresses that this machine alone can reach.
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 

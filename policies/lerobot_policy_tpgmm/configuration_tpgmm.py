@@ -29,7 +29,7 @@ from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.structure.choices import Choices, parse_parts
 from tpgmm_torch.structure.select_ways import SelectWays
 
-__all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
+__all__ = ["TPGMMConfig"]
 
 #: Said of policies of earlier releases.
 OLD = (

@@ -14,17 +14,16 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.eyes import take_over
 from lerobot_policy_tpgmm.observations import is_at_start
 from tpgmm_datasets.lerobot.calibration import calibrated_units
-from tpgmm_datasets.names import pose_groups, value_names
+from tpgmm_datasets.names import value_names
 from tpgmm_datasets.signals import CELL
 from tpgmm_torch.atomic import read_whole
+from tpgmm_torch.data.pose_names import pose_groups
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.structure.choices import operators_or_default
-
-__all__ = ["adopt", "check_dataset", "read_declared"]
 
 log = logging.getLogger(__name__)
 

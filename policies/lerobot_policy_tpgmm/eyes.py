@@ -13,8 +13,6 @@ from lerobot_policy_tpgmm.observations import FrameFeatures
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots import Kinematics, Robot
 
-__all__ = ["make_watch", "open_cell", "take_over"]
-
 # tpgmm_vision, which needs OpenCV, is imported where there is a cell
 
 log = logging.getLogger(__name__)

@@ -12,8 +12,6 @@ from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import contents, read_whole
 from tpgmm_torch.exceptions import ModelFileError
 
-__all__ = ["write_pretrained"]
-
 
 def write_pretrained(model: Any, path: Path, signals: Signals) -> None:
     """Write the directory that LeRobot's commands take as ``--policy.path``.

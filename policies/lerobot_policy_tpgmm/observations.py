@@ -18,17 +18,13 @@ from torch import Tensor, nn
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.conversion.poses import LinkPose
-from tpgmm_datasets.names import match_names, pose_groups
+from tpgmm_datasets.names import match_names
 from tpgmm_datasets.units import Scale, Units, as_scale, units_of
 from tpgmm_torch import Frame
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.pose_names import pose_groups
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import Kinematics
-
-__all__ = [
-    "CONTROL_RATE", "FrameFeatures", "JointFeatures", "check_rate", "find_poses",
-    "is_at_start", "list_placed", "select_observed",
-]  # fmt: skip
 
 REMEDY = (
     "Does the robot have joints that the data have not? --policy.joints='left_*,right_*' names "

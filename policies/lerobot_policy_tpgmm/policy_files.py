@@ -23,8 +23,6 @@ from tpgmm_torch.atomic import read_whole, replacing
 from tpgmm_torch.exceptions import ModelFileError
 from tpgmm_torch.persistence import FILES, load, save
 
-__all__ = ["PATTERNS", "read_model", "write_files"]
-
 #: Folder of the model, as :func:`tpgmm_torch.save` writes it.
 MODEL = "model"
 PROCESSORS = tuple(

@@ -13,7 +13,7 @@ from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 
-__all__ = ["ControlConfig", "EMConfig", "FusionConfig", "TrainingConfig"]
+__all__ = ["ControlConfig", "EMConfig", "FusionConfig"]
 
 #: Bounds for all joints, for each, or for some by name.
 Bound = dict[str, float] | list[float] | float | None

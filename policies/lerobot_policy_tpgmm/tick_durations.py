@@ -15,8 +15,6 @@ from torch import Tensor
 
 from tpgmm_control.loop.locate import LONGEST_TICK
 
-__all__ = ["TickDurations"]
-
 #: Ticks whose mean duration the next one is taken to have: so gently is a late one caught up.
 TICKS: Final = 20
 

@@ -63,10 +63,9 @@ MODULES = list(module_names())
 
 
 def public(module: ModuleType) -> Iterator[str]:
-    """The functions, classes and methods that a module defines and lists in ``__all__``."""
-    for name in getattr(module, "__all__", ()):
-        value = getattr(module, name)
-        if getattr(value, "__module__", None) != module.__name__:
+    """The functions, classes and methods that a module defines without an underscore."""
+    for name, value in list(vars(module).items()):
+        if name.startswith("_") or getattr(value, "__module__", None) != module.__name__:
             continue
         if inspect.isfunction(value) or inspect.isclass(value):
             yield f"{module.__name__}.{name}"

@@ -9,8 +9,6 @@ from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 
-__all__ = ["contacts"]
-
 
 def contacts(
     scene: Scene,

@@ -27,9 +27,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "STYLE", "figure", "legend", "operator_labels", "plot_candidates", "plot_components",
-    "plot_joints", "plot_local", "plot_parts", "plot_relevance", "save", "shade",
-]  # fmt: skip
+    "STYLE",
+    "figure",
+    "plot_candidates",
+    "plot_components",
+    "plot_joints",
+    "plot_local",
+    "plot_parts",
+    "plot_relevance",
+]
 
 #: Colours of Okabe and Ito, which readers with any kind of colour vision tell apart.
 BLUE, GREEN, PURPLE, SKY, VERMILION = "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"

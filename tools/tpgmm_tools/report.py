@@ -33,8 +33,6 @@ from tpgmm_torch.hub.model_card import sections
 from tpgmm_torch.metrics import joint_rmse, largest_speeds, pose_errors
 from tpgmm_torch.operators.base import of_joints
 
-__all__ = ["LeftOut", "leave_one_out", "write_report"]
-
 #: Joints whose candidates are drawn: those that move most.
 DRAWN = 4
 #: A joint is near its limit within this share of its range, or of its speed.

@@ -23,8 +23,6 @@ from tpgmm_torch.data.demonstrations import (
 )
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Alignment", "retime"]
-
 
 def retime(
     demonstration: Demonstration,

@@ -24,7 +24,7 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
-__all__ = ["DynamicTimeWarping", "warn_of_linear_time"]
+__all__ = ["DynamicTimeWarping"]
 
 #: A warp needs no gain that differs from linear time by less than this share of the duration.
 NEARLY_LINEAR = 0.02

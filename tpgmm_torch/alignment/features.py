@@ -16,7 +16,7 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import SMOOTHING, Demonstration
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
-__all__ = ["AlignmentFeatures", "quaternion_columns"]
+__all__ = ["AlignmentFeatures"]
 
 #: Below this fraction of a demonstration's root mean square speed the direction fades out.
 STANDSTILL = 0.3

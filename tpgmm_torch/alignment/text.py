@@ -10,8 +10,6 @@ from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping
 from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["METHODS", "parse_alignment"]
-
 #: Names of alignments.
 METHODS = ("dtw", "barycenter", "linear", "events", "events+dtw", "none")
 

@@ -17,8 +17,6 @@ from scipy.spatial.distance import cdist
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["barycenter", "medoid", "moving_average", "resample", "warping_map", "warping_path"]
-
 Floats = NDArray[np.floating[Any]]
 
 

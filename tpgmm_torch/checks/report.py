@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
-__all__ = ["Finding", "Report", "in_columns", "shorten_list"]
+__all__ = ["Finding", "Report"]
 
 PACKAGE = str(Path(__file__).parents[1])
 

@@ -15,8 +15,6 @@ from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["START", "check_situations"]
-
 #: Within this share of a skill's duration from its begin, a posture is a start.
 START = 0.02
 

@@ -19,7 +19,7 @@ from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["ALIKE", "FrameSummary", "Region", "TrainingSummary"]
+__all__ = ["TrainingSummary"]
 
 #: Situations that differ by less are the same: [rad or m], [m], [rad].
 ALIKE = {"start": 0.02, "place": 0.01, "turn": 0.05}

@@ -20,10 +20,7 @@ from tpgmm_torch.operators.base import carried_objects, frame_names, leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = [
-    "FAR", "IMPOSSIBLE", "EpisodeSummary", "PathSummary", "check", "differing", "summarize",
-    "unit_findings",
-]  # fmt: skip
+__all__ = ["check"]
 
 #: Nothing turns a joint so far beyond its limits [rad]: the values are in another unit.
 IMPOSSIBLE = 2 * math.pi

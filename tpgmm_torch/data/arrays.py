@@ -15,8 +15,6 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import FEW
 
-__all__ = ["Array", "as_array", "as_tensor"]
-
 Array = NDArray[np.float64]
 
 

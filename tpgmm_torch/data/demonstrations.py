@@ -18,10 +18,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
-__all__ = [
-    "FEWEST", "SMOOTHING", "Demonstration", "Situation", "check_demonstrations",
-    "check_robot",
-]  # fmt: skip
+__all__ = ["Demonstration", "Situation"]
 
 #: The fewest demonstrations that have a variance; to leave one out takes one more.
 FEWEST = 2

@@ -13,7 +13,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["LEVER", "STILL", "Frame"]
+__all__ = ["Frame"]
 
 #: Turning a thing by one radian counts as moving it by this distance, half its size [m].
 LEVER = 0.2

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["Hold", "check_holds"]
+__all__ = ["Hold"]
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 TEXT = re.compile(

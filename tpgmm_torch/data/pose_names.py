@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["POSE_PARTS", "is_gripper", "pose_groups", "quaternion_groups", "words"]
-
 #: How the parts of a pose are called after its own name: metres, and (w, x, y, z).
 POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 

@@ -24,8 +24,6 @@ from tpgmm_torch.skills.reproduction import reproduce
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
-__all__ = ["describe", "model_card", "sections"]
-
 #: Rows of the table of what matters when.
 SPANS = 8
 #: Markup of Markdown: references, links and pictures, addresses, code, emphasis.

@@ -14,7 +14,7 @@ from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 from tpgmm_torch.hub.model_card import model_card
 from tpgmm_torch.persistence import FILES, save
 
-__all__ = ["download", "load", "push", "upload"]
+__all__ = ["load", "push"]
 
 #: As the hub has them: an owner, and a name.
 REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)

@@ -22,8 +22,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["moderated_variances", "shrink", "shrinkage_intensity", "trigamma_inverse"]
-
 
 def shrinkage_intensity(
     covariance: Tensor, intensity: float | str, n_samples: Tensor | float

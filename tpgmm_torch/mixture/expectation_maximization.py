@@ -23,12 +23,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.points import Points
 from tpgmm_torch.mixture.row_file import FILE_ROWS
 
-__all__ = [
-    "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
-    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step",
-    "restart_components", "whiten",
-]  # fmt: skip
-
 #: A component is left out of a chunk where its responsibilities are below exp(-36), rounding,
 NEGLIGIBLE = -math.log(torch.finfo(torch.float64).eps)
 #: and guessed to be by densities of the last pass that are less by so much more [nats]: of

@@ -19,8 +19,6 @@ from tpgmm_torch.mixture.expectation_maximization import (
 )
 from tpgmm_torch.mixture.points import Points
 
-__all__ = ["bin_sizes", "draw_starts", "nearest", "time_bins"]
-
 
 def draw_starts(
     method: str,

@@ -12,8 +12,6 @@ from torch import Tensor
 from tpgmm_torch.mixture.processes import Processes
 from tpgmm_torch.mixture.row_file import FILE_ROWS, Rows
 
-__all__ = ["Chunk", "Points"]
-
 #: Standardised rows, columns (x_1; 1; ...; x_P; 1) of shape (sum D_j + P, n), and their numbers
 #: (n,) among those of all processes.
 Chunk = tuple[Tensor, Tensor]

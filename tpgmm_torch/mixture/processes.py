@@ -18,7 +18,7 @@ from torch import distributed as dist
 
 from tpgmm_torch.exceptions import DataError, DistributedError
 
-__all__ = ["ALONE", "Processes", "joined_processes"]
+__all__ = ["joined_processes"]
 
 
 class Processes:

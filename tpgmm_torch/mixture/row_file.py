@@ -16,7 +16,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.mixture.processes import ALONE, Processes
 
-__all__ = ["FILE_ROWS", "ColumnMoments", "RowFile", "Rows", "pieces"]
+__all__ = ["RowFile"]
 
 #: Rows that are read, drawn or kept at once: memory holds no more of a file.
 FILE_ROWS = 2**16

@@ -12,8 +12,6 @@ from torch import Tensor
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 
-__all__ = ["demonstrated_peaks", "joint_peaks", "typical_peaks"]
-
 #: Width of the windows in which polynomials are fitted [s], and in instants.
 WINDOW, FEWEST = 0.25, 9
 #: The share of demonstrations that are no outliers.

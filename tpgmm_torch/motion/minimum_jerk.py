@@ -2,8 +2,6 @@
 
 from torch import Tensor
 
-__all__ = ["minimum_jerk"]
-
 
 def minimum_jerk(fraction: Tensor) -> Tensor:
     """Compute a minimum-jerk step from 0 at fraction 0 to 1 at fraction 1, flat at both ends.

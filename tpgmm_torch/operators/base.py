@@ -14,7 +14,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "carried_objects", "frame_names", "leaves", "of_joints"]
+__all__ = ["Linearization", "Operator"]
 
 
 @dataclass(frozen=True, eq=False)

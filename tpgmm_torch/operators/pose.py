@@ -24,7 +24,7 @@ from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["PoseOperator", "linearize_poses"]
+__all__ = ["PoseOperator"]
 
 
 class PoseOperator(Operator):

@@ -20,7 +20,7 @@ from tpgmm_torch.operators.pose import linearize_poses
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["POSE_OPERATORS", "Stack"]
+__all__ = ["Stack"]
 
 #: Operators that are linearised together. Their M has full row rank at every state, so that
 #: ``M Sigma M^T`` is as definite as what was learned; one of another kind may claim to know a

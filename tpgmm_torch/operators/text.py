@@ -24,7 +24,7 @@ from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import POSE_OPERATORS, Stack
 from tpgmm_torch.operators.wrench import Wrench
 
-__all__ = ["default_operators", "format_operator", "parse_operator"]
+__all__ = ["format_operator", "parse_operator"]
 
 TERM = re.compile(
     r"(canonical(:(?P<joints>[^\s:@+~,]+(,[^\s:@+~,]+)*))?"

@@ -20,7 +20,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["ExpectedForce", "Wrench"]
+__all__ = ["Wrench"]
 
 
 @dataclass(frozen=True)

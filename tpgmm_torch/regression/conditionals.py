@@ -13,8 +13,6 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 
-__all__ = ["ActiveComponents", "Conditionals", "TimeMarginals", "predictive_scale"]
-
 #: Windows to the narrowest component's standard deviation, and at most.
 WINDOWS_PER_STD, MOST_WINDOWS = 4, 4096
 #: Standard deviations beyond the components' means that the windows reach.

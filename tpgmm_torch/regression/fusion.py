@@ -28,8 +28,6 @@ from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["KalmanUpdate", "Projection"]
-
 
 @dataclass(frozen=True, eq=False)
 class Projection:

@@ -14,7 +14,7 @@ from tpgmm_torch.operators.base import carried_objects, leaves
 from tpgmm_torch.regression.prior import PRIOR_STD, given_widths
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["CovarianceFusion", "Fusion", "InformationFusion"]
+__all__ = ["CovarianceFusion", "InformationFusion"]
 
 
 @dataclass(frozen=True)

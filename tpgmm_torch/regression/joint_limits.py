@@ -27,8 +27,6 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
 
-__all__ = ["keep_within", "step_within", "within"]
-
 #: Added to unit variances before they are inverted: rounding may have made them singular.
 JITTER = 1e-12
 #: What the solver says of a minimum, and of a precision that is not positive.

@@ -37,8 +37,6 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["PostureCost", "PostureSearch", "Residual", "descend"]
-
 #: Components of a smaller weight do not count.
 NEGLIGIBLE = 1e-5
 #: Damping, as a share of the precision: at least, at first after a step that failed, and at

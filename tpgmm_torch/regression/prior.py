@@ -15,8 +15,6 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["PRIOR_STD", "given_widths", "prior_widths"]
-
 #: The default [rad], or in units of the learned positions' size: wider than any joint moves, so
 #: that it decides nothing that operators decide.
 PRIOR_STD = 10.0

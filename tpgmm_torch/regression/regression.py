@@ -43,7 +43,7 @@ from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.training.learning import Learned
 
-__all__ = ["Components", "Regression"]
+__all__ = ["Regression"]
 
 #: Robots at a time on a processor: few enough that its cache holds what is between the
 #: operations, and that this memory is not given back and asked for again each time.

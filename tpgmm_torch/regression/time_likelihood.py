@@ -26,8 +26,6 @@ from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["TimeLikelihood"]
-
 
 class TimeLikelihood:
     """The likelihood over a grid of times, of the operators of a mixture.

@@ -11,8 +11,6 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import UrdfJoint, write_urdf
 
-__all__ = ["chain_to_urdf"]
-
 
 def chain_to_urdf(chain: Any) -> str:
     """Write a URDF that moves as a chain of pytorch_kinematics does.

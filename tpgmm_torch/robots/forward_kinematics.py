@@ -24,8 +24,6 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.robots.kinematic_tree import Body
 
-__all__ = ["TreeKinematics"]
-
 #: Robots up to which fewer operations are faster: one takes 64 us in place of 93, and 2000
 #: would take 32 ms in place of 13.
 FEW = 8

@@ -11,8 +11,6 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["held_objects"]
-
 
 def held_objects(
     state: RobotState,

@@ -15,8 +15,6 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import FREEDOMS, Mimic, UrdfJoint, UrdfModel, motion
 
-__all__ = ["Body", "reduce"]
-
 
 @dataclass(frozen=True, eq=False)
 class Body:

@@ -23,7 +23,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
-__all__ = ["Described", "JointSpace", "Kinematics", "RobotState", "parse_dtype"]
+__all__ = ["JointSpace", "Kinematics", "RobotState"]
 
 
 def parse_dtype(dtype: Any) -> torch.dtype:

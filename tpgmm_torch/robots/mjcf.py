@@ -35,8 +35,6 @@ from tpgmm_torch.robots.urdf import (
     write_urdf,
 )
 
-__all__ = ["mjcf_to_urdf"]
-
 HOW_TO_INSTALL = "pip install 'tpgmm-torch[simulation]'"
 
 
@@ -71,7 +69,7 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
 
 
 def mujoco_module(purpose: str) -> Any:
-    """Import MuJoCo, or raise an error that says what needs it and how to install it."""
+    """Import MuJoCo, or raise an error that names the ``purpose`` and how to install it."""
     try:
         import mujoco
     except ImportError as error:
@@ -80,7 +78,7 @@ def mujoco_module(purpose: str) -> Any:
 
 
 def compile_mjcf(mjcf: str | os.PathLike[str], what: str) -> Any:
-    """Compile an MJCF, a path or the text itself, that errors call ``what``."""
+    """Compile ``mjcf``, a path or the text itself, which errors call ``what``."""
     mujoco = mujoco_module(f"compiling {what}")
     try:
         if is_text(mjcf):

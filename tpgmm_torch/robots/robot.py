@@ -24,7 +24,7 @@ from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, U
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
-from tpgmm_torch.robots.kinematics import Described, Kinematics, RobotState, parse_dtype
+from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 from tpgmm_torch.robots.urdf import (
     LIMITS,
@@ -38,7 +38,7 @@ from tpgmm_torch.robots.urdf import (
     read_urdf,
 )
 
-__all__ = ["Kinematics", "Robot", "RobotState"]
+__all__ = ["Robot"]
 
 #: A joint vector or a chain longer than this is no robot's, and Jacobians grow with its square.
 MOST_JOINTS = 1000

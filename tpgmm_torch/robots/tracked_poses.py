@@ -19,7 +19,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 
-__all__ = ["Poses", "PosesState"]
+__all__ = ["Poses"]
 
 
 class PosesState(RobotState):

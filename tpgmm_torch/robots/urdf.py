@@ -24,12 +24,6 @@ from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, TPGMMError, UnknownNameError
 
-__all__ = [
-    "Mimic", "UrdfJoint", "UrdfModel", "description_text", "free_name", "is_text",
-    "joint_element", "motion", "numbers", "origin", "parse_xml", "placement", "read_urdf",
-    "roll_pitch_yaw", "write_urdf",
-]  # fmt: skip
-
 #: Limits of a joint, in the order in which they are tabulated.
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 #: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.

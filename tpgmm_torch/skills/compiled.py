@@ -34,7 +34,7 @@ from tpgmm_torch.regression.regression import Components, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["CompiledRegression", "compile_skill", "export_estimate"]
+__all__ = ["compile_skill"]
 
 #: Robots of the graph that serves many, whose numbers a processor's cache holds.
 PART = 64

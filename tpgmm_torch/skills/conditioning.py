@@ -50,8 +50,6 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_point import ViaPoint
 
-__all__ = ["Cluster", "Request", "Surroundings", "covariance_between", "wendland"]
-
 #: Linearisations at a tick: where there was none before, and where there was one.
 FIRST, LATER = 8, 1
 #: Joints move by no more at a linearisation than this [rad or m].

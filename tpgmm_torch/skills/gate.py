@@ -8,8 +8,6 @@ from typing import Any
 
 from tpgmm_torch.data.holds import Hold
 
-__all__ = ["CONDITIONS", "CONTACT", "SWITCH", "Condition", "Gate"]
-
 #: Conditions by name; ``contact:LINK`` is one too.
 CONDITIONS = ("arrived", "held", "free")
 CONTACT = "contact:"

@@ -18,8 +18,6 @@ from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Held", "Holding", "choose"]
-
 #: The unit of motions [m], [rad]: an object that moves by one with a link is carried.
 MOVED, TURNED = 0.01, math.radians(5)
 #: It may move with a link if its pose there changes by less than this share of the motion.

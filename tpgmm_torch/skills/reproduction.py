@@ -27,8 +27,6 @@ from tpgmm_torch.skills.situations import complete_situations, with_novelty
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 
-__all__ = ["Tick", "open_loop", "reproduce", "sample"]
-
 #: Reference, estimate and held objects at a time.
 Tick = tuple[Tensor, Estimate, Holding]
 

@@ -18,15 +18,6 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = [
-    "at_first",
-    "complete_frames",
-    "complete_situations",
-    "report_start",
-    "tick_inputs",
-    "with_novelty",
-]
-
 
 def complete_frames(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
     """Frames, and those that are not given but follow from the start posture.

@@ -21,7 +21,7 @@ from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.skills.gate import Gate
 
-__all__ = ["CompositeSkill", "Skill"]
+__all__ = ["Skill"]
 
 
 class Skill(Protocol):

@@ -20,7 +20,7 @@ from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import CompositeSkill
 
-__all__ = ["WayChoice", "Ways"]
+__all__ = ["Ways"]
 
 #: Instants of a coarse reproduction that shows whether a way can be gone.
 INSTANTS = 40

@@ -29,15 +29,6 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = [
-    "Choices",
-    "aligner",
-    "learn",
-    "operators_or_default",
-    "parse_parts",
-    "prepare_demonstrations",
-]
-
 
 @dataclass(frozen=True)
 class Choices:

@@ -24,8 +24,6 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import Motion, local_data
 from tpgmm_torch.training.training_rows import typical
 
-__all__ = ["Evidence", "gather_evidence"]
-
 #: No sensor agrees with itself to less [m or rad]: what never varies stays finite.
 RESOLUTION = 1e-3
 

@@ -33,7 +33,7 @@ from tpgmm_torch.training.hold_detection import demonstrated_holds, with_holds
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
-__all__ = ["Judgement", "SelectOperators", "arrange", "candidate_operators"]
+__all__ = ["SelectOperators"]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["attach_holds", "demonstrated_holds", "find_holds", "holding_as_in", "with_holds"]
+__all__ = ["attach_holds", "find_holds"]
 
 #: What moved by less than so many tolerances may as well have been jolted, or seen badly.
 TRAVEL = 3.0

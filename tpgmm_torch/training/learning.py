@@ -33,8 +33,6 @@ from tpgmm_torch.training.mixture_settings import (
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
 from tpgmm_torch.training.training_rows import TrainingRows, batches_of, check_alike, read_rows
 
-__all__ = ["Learned", "from_parameters", "learn"]
-
 #: Parameters of the estimator that are the mixture's too.
 SHARED = (
     "n_components", "covariance_type", "tol", "max_iter", "n_init", "init_params",

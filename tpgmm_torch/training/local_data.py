@@ -18,10 +18,6 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = [
-    "Expected", "Motion", "at_phases", "constant_columns", "like", "local_data", "match_rows",
-]  # fmt: skip
-
 #: The local coordinates (T, D_j) of operator j that are expected at times (T,).
 Expected = Callable[[int, Tensor], Tensor]
 

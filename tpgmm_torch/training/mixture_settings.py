@@ -19,8 +19,6 @@ from tpgmm_torch.operators.base import leaves, of_joints
 from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.robots.kinematics import JointSpace, Kinematics
 
-__all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
-
 #: Of these, equal ones say the same; of a user's own operators nobody knows.
 COMPARED = (Canonical, Wrench, *POSE_OPERATORS)
 

@@ -25,8 +25,6 @@ from tpgmm_torch.operators import (
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import Motion
 
-__all__ = ["shares_of_work", "with_force_axes", "with_mean_orientations"]
-
 #: A force does no work along an axis below this share of the work that it could do. Forces
 #: against a surface have shares of 0.00 to 0.02, friction 0.26 to 0.88 (wiping).
 NO_WORK = 0.1

@@ -27,10 +27,7 @@ from tpgmm_torch.training.local_data import at_phases
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
-__all__ = [
-    "Outlying", "comparable_coordinates", "drop_outliers", "outlying_demonstrations",
-    "outlying_rows", "unlike_the_others",
-]  # fmt: skip
+__all__ = ["drop_outliers"]
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5

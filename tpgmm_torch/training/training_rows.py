@@ -36,11 +36,6 @@ from tpgmm_torch.training.local_data import (
 from tpgmm_torch.training.mixture_settings import block_widths
 from tpgmm_torch.training.operator_completion import with_force_axes, with_mean_orientations
 
-__all__ = [
-    "TrainingRows", "batches_of", "check_alike", "equivalent_points", "equivalent_rows",
-    "read_rows", "typical",
-]  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class TrainingRows:

@@ -45,10 +45,7 @@ from tpgmm_vision.camera import Camera
 from tpgmm_vision.poses import Array, angle_between, inverse, pose_matrix, pose_vector
 from tpgmm_vision.targets import Target, target_from
 
-__all__ = [
-    "Cell", "CellCamera", "CellCheck", "CellObject", "cell_from", "cell_of", "check_robot",
-    "read_cell", "write_cell",
-]  # fmt: skip
+__all__ = ["Cell", "read_cell", "write_cell"]
 
 #: Poses that are nearer to each other are the same: [mm], [deg].
 SAME_PLACE, SAME_ANGLE = 0.1, 0.02

@@ -13,11 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = [
-    "Array", "angle_between", "inverse", "mean_pose", "pose_matrix", "pose_vector",
-    "rigid", "transform",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 #: Poses further than this from the middle of all, or this many times their median distance, do
 #: not count in a mean: [m], [rad], and the share.

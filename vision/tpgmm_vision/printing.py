@@ -21,7 +21,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array
 from tpgmm_vision.targets import DEFAULT_FAMILY, Board, dictionary_of, modules_of, target_from
 
-__all__ = ["PAGES", "print_targets"]
+__all__ = ["print_targets"]
 
 #: Width and height of pages [mm].
 PAGES = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}

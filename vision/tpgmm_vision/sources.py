@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_vision.poses import Array
 
-__all__ = ["SOURCES", "ObservedPose", "PoseSource", "pose_source"]
+__all__ = ["ObservedPose", "PoseSource", "pose_source"]
 
 #: Group of entry points: functions ``make(cell, robot) -> PoseSource`` by name.
 SOURCES = "tpgmm.pose_sources"

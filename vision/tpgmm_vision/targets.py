@@ -16,17 +16,7 @@ import numpy as np
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array, pose_matrix, transform
 
-__all__ = [
-    "FAMILIES",
-    "Board",
-    "Target",
-    "bundle",
-    "cube",
-    "dictionary_of",
-    "modules_of",
-    "tag",
-    "target_from",
-]
+__all__ = ["Board", "Target", "cube", "tag"]
 
 #: Families of tags that OpenCV decodes, by name.
 FAMILIES: dict[str, int] = {

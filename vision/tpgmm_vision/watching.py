@@ -16,8 +16,6 @@ from tpgmm_vision.cell import Cell, check_robot
 from tpgmm_vision.poses import Array, mean_pose, pose_matrix, pose_vector
 from tpgmm_vision.sources import ObservedPose, pose_source
 
-__all__ = ["Watch"]
-
 #: An object's first pose is the mean of this number of poses, out of so many last pictures:
 #: three outvote one that is wrong, and three of ten come where most pictures are lost.
 FIRST, RECENT = 3, 10

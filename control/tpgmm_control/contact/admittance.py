@@ -25,7 +25,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Admittance", "Offsets"]
+__all__ = ["Admittance"]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from tpgmm_torch import gaussians
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Impedance", "Stiffness", "geometric_mean"]
+__all__ = ["Impedance", "Stiffness"]
 
 Numbers = float | tuple[float, ...]
 

@@ -23,7 +23,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.regression.estimate import Estimate
 
-__all__ = ["Command", "Status", "refused", "statuses"]
+__all__ = ["Command", "Status"]
 
 
 class Status(StrEnum):

@@ -14,8 +14,6 @@ from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["choose", "estimate"]
-
 
 def estimate(
     skill: Skill,

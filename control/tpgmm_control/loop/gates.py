@@ -22,7 +22,7 @@ from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.gate import CONTACT, Condition, Gate
 from tpgmm_torch.skills.holding import MOVED, Holding, choose
 
-__all__ = ["Gates", "Grip", "Moment"]
+__all__ = ["Moment"]
 
 #: Share of its way with a hand by which an object that is held may be off, as of holds that
 #: are found in how objects move.

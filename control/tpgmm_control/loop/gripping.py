@@ -6,8 +6,6 @@ from torch import Tensor
 from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["gripping_joints"]
-
 
 def gripping_joints(kinematics: Kinematics) -> Tensor | None:
     """Find joints that close around things: named as grippers, and moving no link.

@@ -31,8 +31,6 @@ from tpgmm_torch.skills.holding import (
 )
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["HoldWatch", "Holds", "Rest"]
-
 #: Distance [m], angle [rad] and time [s] after which an object is lost by its link.
 LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
 #: Time between tests whether an object is lost [s].

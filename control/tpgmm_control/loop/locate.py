@@ -34,8 +34,6 @@ from tpgmm_control.sensing.servo import FLOOR, Flags, Servo
 from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["LONGEST_TICK", "RUNNING", "Progress", "Seen"]
-
 #: A time of the skill for a robot (row) at a posture, if one explains it.
 Find = Callable[[int, Array], float | None]
 

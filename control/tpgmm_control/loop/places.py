@@ -18,8 +18,6 @@ from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.holding import Holding
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["Places"]
-
 #: Spacing of the times that are tried, at least [s], and how many there are at most.
 SPACING, MOST = 0.04, 4096
 #: Mean distance of a displaced robot's place from the present time [s]. Ahead counts twice: of

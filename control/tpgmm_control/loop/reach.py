@@ -17,8 +17,6 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Fade", "fading_time", "nearest"]
-
 #: How fast a gap fades in the mean [rad/s or m/s], where that takes less time than a blend;
 #: the least share of the blend that it takes.
 FADING, SHORTEST = 0.03, 0.1

@@ -13,10 +13,10 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.skills.reproduction import Tick, reproduce, sample
+from tpgmm_torch.skills.reproduction import Tick, reproduce
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["rollout", "sample"]
+__all__ = ["rollout"]
 
 
 def rollout(

@@ -26,8 +26,6 @@ from tpgmm_control.motion.limit_arrays import limit_arrays
 from tpgmm_control.motion.trajectory_generator import braked_part, first_part, rest_positions
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["Braking", "rest"]
-
 #: Further away than this within a tick no joint is asked to go [rad or m].
 FAR = 10.0
 

@@ -12,8 +12,6 @@ from torch import Tensor
 from tpgmm_control.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 
-__all__ = ["Following"]
-
 
 @dataclass(frozen=True, eq=False)
 class Following:

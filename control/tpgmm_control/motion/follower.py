@@ -31,8 +31,6 @@ from tpgmm_torch.data.arrays import Array, as_array, as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 
-__all__ = ["Follower", "Seconds"]
-
 Mask = NDArray[np.bool_]
 #: A duration, of all robots or of each one [s].
 Seconds = float | Array

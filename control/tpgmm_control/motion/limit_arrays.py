@@ -11,8 +11,6 @@ import numpy as np
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 
-__all__ = ["LimitArrays", "limit_arrays"]
-
 #: Share of a bound that rounding may add to it.
 ROUNDING = 1e-9
 #: In place of an infinite bound where numbers have to be finite.

@@ -21,8 +21,6 @@ from ruckig import (
 from tpgmm_control.motion.limit_arrays import ENDLESS
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["braked_part", "first_part", "rest_positions", "stopping_range"]
-
 
 def first_part(start: Array, target: Array, drift: Array, dt: Array, limits: Array) -> Array:
     """The state of the fastest motions to targets after ``dt``.

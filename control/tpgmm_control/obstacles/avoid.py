@@ -43,8 +43,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Avoidance"]
-
 #: How exactly hands are led [m, rad], and joints, which are free to give way.
 HAND, TURN, JOINT = 0.005, 0.05, 0.5
 #: How much joints change their way around in a tick [rad or m]: less where the ordinary

@@ -23,8 +23,6 @@ from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.robots.mjcf import mujoco_module
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["Geometry", "Near", "Placed"]
-
 Indices = NDArray[np.intp]
 
 #: First version of MuJoCo whose distances agree with what touches, for all kinds of solids.

@@ -26,7 +26,7 @@ from tpgmm_torch.robots.mjcf import compile_mjcf
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
-__all__ = ["Pair", "Scene"]
+__all__ = ["Scene"]
 
 #: Names of two links, objects or obstacles, in alphabetical order.
 Pair = tuple[str, str]

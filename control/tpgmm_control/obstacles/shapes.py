@@ -17,7 +17,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.mjcf import compile_mjcf, mujoco_module
 from tpgmm_torch.robots.urdf import free_name, parse_xml
 
-__all__ = ["Shape", "excluded", "solids", "urdf_solids"]
+__all__ = ["Shape"]
 
 #: How many numbers say how large a solid is: half edges; radius; radius and half length.
 SIZES: Mapping[str, int] = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3}

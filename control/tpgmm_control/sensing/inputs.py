@@ -31,8 +31,6 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Inputs"]
-
 #: Faults of readings in words.
 FAULTS = {
     LOST: "is missing or not finite",

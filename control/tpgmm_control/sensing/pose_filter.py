@@ -13,7 +13,7 @@ from scipy.special import gammaincinv
 from tpgmm_control.sensing.states import check_positive
 from tpgmm_torch.data.frames import LEVER
 
-__all__ = ["OneEuro", "PoseFilter"]
+__all__ = ["OneEuro"]
 
 Floats = NDArray[np.float64]
 

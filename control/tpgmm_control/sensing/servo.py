@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["Flags", "Servo"]
-
 Flags = NDArray[np.bool_]
 #: Lags of position servos, from stiff industrial drives to soft hobby servos [s].
 LAGS = np.geomspace(0.01, 0.64, 7)[:, None, None]

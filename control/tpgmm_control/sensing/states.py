@@ -4,8 +4,6 @@ from typing import Any
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["check_positive", "replace_fields"]
-
 
 def replace_fields[State](state: State, **values: Any) -> State:
     """Copy a frozen dataclass with other values of some fields.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tpgmm_control.sensing.states import check_positive, replace_fields
 
-__all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
+__all__ = ["Trust"]
 
 #: Whether a reading was accepted, and why not.
 ACCEPTED, LOST, IMPOSSIBLE, JUMPED, OTHER_UNIT, DEAD, FLIPPED = range(7)

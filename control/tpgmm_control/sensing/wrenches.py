@@ -16,8 +16,6 @@ from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.operators import Wrench
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["WrenchReading", "Wrenches", "wrench_of_efforts"]
-
 #: Time constant of the filter of wrenches [s]: above the period of their noise, below that of
 #: an arm that bounces.
 SMOOTHING_TIME = 0.01

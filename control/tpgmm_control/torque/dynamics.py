@@ -16,7 +16,7 @@ from tpgmm_torch.robots.mjcf import mujoco_module
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import description_text, is_text, parse_xml
 
-__all__ = ["Dynamics", "MujocoDynamics"]
+__all__ = ["MujocoDynamics"]
 
 
 class Dynamics(Protocol):

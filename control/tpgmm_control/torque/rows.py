@@ -33,8 +33,6 @@ from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["LocalGaussians", "Mechanics", "TorqueRows", "fastest", "force_row", "fused_torque"]
-
 #: Directions in which links move by less than this share of what their axes suggest are given
 #: up smoothly, as postures become singular (a ratio of eigenvalues, without a unit).
 SINGULAR = 1e-3

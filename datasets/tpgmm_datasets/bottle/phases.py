@@ -10,8 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["Phases"]
-
 #: By which share of its demonstration's pace a phase takes more or less time.
 UNEVEN = 0.12
 

@@ -36,20 +36,7 @@ from tpgmm_torch import (
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
-__all__ = [
-    "TASK",
-    "BottleShaking",
-    "BottleSkill",
-    "approach_bottle",
-    "between",
-    "bottle_operators",
-    "either",
-    "follow_hands",
-    "place_hand",
-    "pose_error",
-    "upper_body",
-    "upright",
-]
+__all__ = ["BottleShaking", "bottle_operators", "upper_body"]
 
 #: What LeRobot data sets of the skill call it.
 TASK = "shake the bottle"

@@ -21,7 +21,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["PACKAGE", "check", "check_summaries"]
+__all__ = ["check"]
 
 #: Warnings name the line that called this package.
 PACKAGE = str(Path(__file__).parents[1])

@@ -16,8 +16,6 @@ from tpgmm_torch.data.pose_names import is_gripper, pose_groups, quaternion_grou
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.tracked_poses import Poses
 
-__all__ = ["joint_findings", "quaternion_columns"]
-
 #: Differences of noisy positions are larger than speeds: by so much the 98 % quantile and the
 #: largest may be.
 FAST, FASTEST = 1.2, 3.0

@@ -8,8 +8,6 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["CONSISTENT", "FEWEST", "outliers", "set_apart"]
-
 #: Fewer numbers do not show what is usual.
 FEWEST = 4
 #: Outliers are so many robust standard deviations from the median.

@@ -5,8 +5,6 @@ from math import nan
 
 from tpgmm_torch.checks.report import Finding, shorten_list
 
-__all__ = ["report_at"]
-
 
 def report_at(
     check: str,

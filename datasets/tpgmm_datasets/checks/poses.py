@@ -16,8 +16,6 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["pose_findings"]
-
 #: Objects within this distance [m] or angle [rad] of the usual place are where others are.
 NEAR, ALIKE = 0.15, float(np.deg2rad(60.0))
 #: A hand that handles an object comes so near to its origin [m].

@@ -15,8 +15,6 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 
-__all__ = ["JointEvent", "RecordingSummary"]
-
 #: Instants of equal phase at which paths are compared.
 PHASES = 21
 #: A step is a jump if it is so many times the 98 % quantile of the joint's steps, this share of

@@ -23,14 +23,12 @@ from tpgmm_datasets.lerobot.stored_signals import (
     stored_wrenches,
     wrench_features,
 )
-from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.pose_names import pose_groups
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import holding_as_in
-
-__all__ = ["Assembly", "EventSource", "FrameSource"]
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]

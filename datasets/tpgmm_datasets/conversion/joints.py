@@ -17,8 +17,6 @@ from tpgmm_datasets.names import NAME_ALL, match_names
 from tpgmm_datasets.units import Scale, Unit, Units, add_offsets, as_scale, convert, units_of
 from tpgmm_torch.checks.report import Finding
 
-__all__ = ["JointColumns", "commanded_joints", "joint_feature", "names_of"]
-
 Names = Mapping[str, str] | Sequence[str]
 
 #: Where the joints are, in order of preference.

@@ -14,7 +14,6 @@ import torch
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.layout import Feature
-from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.tables import numbers, read_table
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import shorten_list
@@ -22,12 +21,13 @@ from tpgmm_torch.checks.training import FAR
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.pose_names import pose_groups
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["FramePose", "LinkPose", "MeasuredPoses"]
+__all__ = ["FramePose", "LinkPose"]
 
 #: Number of values of each way to write a rotation.
 ROTATIONS = {"wxyz": 4, "xyzw": 4, "rotvec": 3, "euler": 3, "yaw": 1, None: 0}

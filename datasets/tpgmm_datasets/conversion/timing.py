@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.names import quaternion_groups
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.pose_names import quaternion_groups
 
 __all__ = ["resample", "trim"]
 

@@ -17,8 +17,6 @@ from tpgmm_datasets.names import match_names
 from tpgmm_datasets.units import Scale
 from tpgmm_torch.atomic import read_whole
 
-__all__ = ["Calibration", "calibrated_units"]
-
 #: One file, or one for the motors of each arm by what stands before their names: ``left_``.
 Calibration = str | Path | Mapping[str, str | Path]
 

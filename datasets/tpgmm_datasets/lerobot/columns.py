@@ -28,14 +28,11 @@ import pyarrow as pa
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature
-from tpgmm_datasets.names import POSE_PARTS
 from tpgmm_datasets.units import POSE_UNITS, with_pose_units
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-
-__all__ = ["features_of", "with_frames"]
-
+from tpgmm_torch.data.pose_names import POSE_PARTS
 
 Array = np.ndarray[Any, Any]
 Features = dict[str, dict[str, Any]]

@@ -18,8 +18,6 @@ from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
 from tpgmm_datasets.lerobot.parquet import MOST_IN_EPISODE, episode_tables, open_parquet
 from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
-__all__ = ["EpisodeRows", "Policy", "Relaxed", "read_episodes"]
-
 Array = np.ndarray[Any, Any]
 #: What is done with a problem: raise it, or let it pass.
 Policy = Callable[[DatasetError], None]

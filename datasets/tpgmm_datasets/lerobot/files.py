@@ -8,8 +8,6 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-__all__ = ["METADATA_KEY", "chunked_files", "file_path", "free_place", "write_tables"]
-
 #: Under this key the data files repeat what ``info.json`` declares, so that an edit of the
 #: one is noticed by the other.
 METADATA_KEY = b"tpgmm_datasets"

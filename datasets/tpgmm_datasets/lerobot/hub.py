@@ -10,8 +10,6 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_torch.atomic import recover
 from tpgmm_torch.exceptions import DependencyError
 
-__all__ = ["local_folder"]
-
 #: How a name says that it is the hub's, as in huggingface_hub's own paths.
 HUB = "hf://datasets/"
 REPO_ID = r"[\w.-]+/[\w.-]+"

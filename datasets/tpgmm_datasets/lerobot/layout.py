@@ -20,8 +20,6 @@ from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_datasets.names import value_names
 from tpgmm_torch.atomic import read_whole
 
-__all__ = ["Episode", "Feature", "Layout", "episode_file", "open_layout"]
-
 #: Columns that LeRobot keeps for itself.
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 CAMERAS = ("video", "image")

@@ -15,8 +15,6 @@ import pyarrow.parquet as pq
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_torch.atomic import open_whole
 
-__all__ = ["MOST_IN_EPISODE", "episode_tables", "open_parquet", "read_columns"]
-
 #: Rows that are decoded at a time: what bounds the memory of an iteration.
 BATCH_ROWS = 1 << 16
 #: Rows times columns of what is read whole, and rows times values of an episode: beyond, the

@@ -10,8 +10,6 @@ import numpy as np
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["row_times", "time_problems"]
-
 #: Fractions of a period: how far a row may be off its place on the grid, and how long a step
 #: may be.
 OFF_GRID, LONGEST_STEP = 0.01, 1.5

@@ -11,8 +11,6 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["QUANTILES", "Statistics", "episode_statistics", "merge_statistics", "stated_range"]
-
 #: By column, by name of the statistic: one value per value of the column.
 Statistics = dict[str, dict[str, Array]]
 

@@ -16,8 +16,6 @@ from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
 from tpgmm_datasets.lerobot.layout import Feature, Layout, open_layout
 
-__all__ = ["event_features", "stored_events"]
-
 
 def event_features(layout: Layout) -> list[Feature]:
     """List the columns of a data set that tell of events."""

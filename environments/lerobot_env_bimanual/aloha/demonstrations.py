@@ -26,8 +26,6 @@ from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["record_aloha"]
-
 
 def record_aloha(
     path: str | Path,

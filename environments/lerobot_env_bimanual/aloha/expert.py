@@ -23,8 +23,6 @@ from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["AlohaExpert", "WayPoint"]
-
 
 def _turn_about(quaternion: Tensor, **axes: float) -> Tensor:
     """Turn on about axes of the body, given in degrees."""

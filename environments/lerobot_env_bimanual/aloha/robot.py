@@ -15,11 +15,6 @@ from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
-__all__ = [
-    "ARM_JOINTS", "GRIPPERS", "JOINTS", "OBJECTS", "SIDES", "aloha_operators", "aloha_robot",
-    "aloha_urdf",
-]  # fmt: skip
-
 SIDES = ("left", "right")
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
 #: What the error says where gym-aloha is missing.

@@ -32,7 +32,7 @@ from tpgmm_datasets.bottle.skill import (
 )
 from tpgmm_torch import Demonstration, Frame, Situation, quaternions
 
-__all__ = ["TASK", "CarryAndPut", "before_sliding", "slid", "slide"]
+__all__ = ["CarryAndPut"]
 
 #: What LeRobot data sets of the skill call it.
 TASK = "put the bottle on the tray"

@@ -10,8 +10,6 @@ import numpy as np
 from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.skill import BottleShaking, BottleSkill
 
-__all__ = ["draw_start", "skill"]
-
 #: The bottle's mass [kg]: a light one, up to one with a litre in it.
 MASS = (0.5, 1.5)
 

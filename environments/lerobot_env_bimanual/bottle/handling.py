@@ -19,8 +19,6 @@ from lerobot_env_bimanual.disturbances import Course, displace_pose
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Demonstration, Frame
 
-__all__ = ["BottleEnv"]
-
 #: The grip gives way at this force [N], without dynamics at this displacement [m].
 GRIP_FORCE, GRIP_SLIP = 100.0, 0.03
 

@@ -11,10 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "FIGURES", "PUT_FIGURES", "Closing", "Figure", "Shaking", "find_shaking", "successful",
-]  # fmt: skip
-
 
 class Figure(NamedTuple):
     """A figure of an episode, which is 0 or more.

@@ -30,16 +30,6 @@ from lerobot_env_bimanual.robot_scene import (
 )
 from tpgmm_datasets.bottle.skill import FOOT, GRASP_POINT, HANDS
 
-__all__ = [
-    "CARRIERS",
-    "FOOT",
-    "TABLE_LOW",
-    "BottleScene",
-    "Snapshot",
-    "TrayScene",
-    "bottle_spec",
-]
-
 #: Height of the cap's top above the bottle's origin [m], on which a cube of tags stands; a tag
 #: lies before the tray.
 CAP = FOOT + 0.062

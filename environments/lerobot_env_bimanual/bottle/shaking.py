@@ -22,7 +22,7 @@ from tpgmm_datasets.bottle.skill import FOOT, PHASES, SHOULDERS, TASK, BottleSha
 from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["AMPLITUDE", "FREQUENCY", "BottleShakingEnv"]
+__all__ = ["BottleShakingEnv"]
 
 #: Of the demonstrations with a steady rhythm [Hz, rad].
 FREQUENCY = BottleShaking.cycles / PHASES["shake"]

@@ -18,7 +18,7 @@ from lerobot_env_bimanual.robot_scene import DAMPING, STIFFNESS, add_geom
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["CONTROLS", "BottleTorqueEnv", "TorqueScene"]
+__all__ = ["BottleTorqueEnv"]
 
 #: What an action can be.
 CONTROLS = ("impedance", "reference", "torque")

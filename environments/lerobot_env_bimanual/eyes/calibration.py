@@ -19,8 +19,6 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_vision.detection.tags import TagDetector
 from tpgmm_vision.poses import Array, inverse, transform
 
-__all__ = ["calibration_episode", "chain_of", "varied_postures"]
-
 Vector = NDArray[np.float64]
 Reading = Callable[[Vector], Vector]
 #: So many postures are drawn, from the middle share of the ranges of the joints.

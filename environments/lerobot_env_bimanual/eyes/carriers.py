@@ -15,8 +15,6 @@ from lerobot_env_bimanual.robot_scene import add_geom
 from tpgmm_vision.poses import Array, pose_vector, rigid
 from tpgmm_vision.targets import FAMILIES, Target, modules_of, target_from
 
-__all__ = ["CUBE_ROOM", "Carrier", "add_carrier", "cube_at", "flat_at"]
-
 #: Edges of the black squares of tags on cubes, and of those that lie flat [m].
 CUBE, FLAT = 0.040, 0.060
 #: How far from a surface the middle of a cube is that is fixed to it [m].

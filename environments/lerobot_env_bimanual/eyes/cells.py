@@ -6,8 +6,6 @@ from typing import Any
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["cell_of"]
-
 
 def cell_of(env: Any) -> dict[str, Any]:
     """Return the true content of the cell file of an environment with cameras.

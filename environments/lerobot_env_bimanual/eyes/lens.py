@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.camera import Camera
 
-__all__ = ["Imperfections", "Lens", "usual_camera"]
-
 Picture = NDArray[np.uint8]
 #: Of a usual webcam: focal length and the principal point's distance from the middle as shares
 #: of the width, and the distortion of its lens, k1 k2 p1 p2 k3.

@@ -17,8 +17,6 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.cell import write_cell
 
-__all__ = ["CODECS", "recording", "recording_of", "rig_to_record", "row"]
-
 #: What pictures are stored as: LeRobot's own choice, the other usual codec, no video.
 CODECS = {"av1": "libsvtav1", "h264": "h264", "pictures": None}
 CELL = "cell.json"

@@ -19,8 +19,6 @@ from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import camera_content, pose_content
 from tpgmm_vision.poses import Array, inverse, pose_vector, rigid
 
-__all__ = ["IMAGES", "Rig", "View", "looking"]
-
 #: How LeRobot names the features of cameras.
 IMAGES = "observation.images."
 #: OpenCV's camera looks along z, y down; MuJoCo's along -z, y up.

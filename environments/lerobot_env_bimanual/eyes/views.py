@@ -12,8 +12,6 @@ from lerobot_env_bimanual.eyes.carriers import Carrier, cube_at
 from lerobot_env_bimanual.eyes.rig import View, looking
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["CHECK", "VIEWS", "around", "chosen_views"]
-
 #: The middle of what happens on the table [m].
 CENTRE = (0.28, 0.0, 0.15)
 #: Tags that stand still beside the table, as they would at the base of the robot.

@@ -15,8 +15,6 @@ from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv, metaworld_li
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Recorded", "record_metaworld"]
-
 #: The expert goes on for so long after its success [steps]: a motion that ends at the threshold
 #: of success would end short of it as often as not.
 AFTER = 20

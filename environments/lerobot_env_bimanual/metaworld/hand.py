@@ -15,11 +15,6 @@ from tpgmm_torch import Canonical, RelativePosition, Robot
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.urdf import UrdfJoint, write_urdf
 
-__all__ = [
-    "ACTION_SCALE", "FPS", "FRAMES", "JOINTS", "displacement", "effort", "metaworld_operators",
-    "metaworld_robot", "opening",
-]  # fmt: skip
-
 #: Actions per second: five steps of 2.5 ms each.
 FPS = 80
 #: How far an action of 1 moves the hand's target [m].

@@ -15,8 +15,6 @@ from lerobot_env_bimanual.metaworld.hand import FPS, FRAMES, JOINTS, displacemen
 from lerobot_env_bimanual.metaworld.tasks import check_task
 from tpgmm_torch.exceptions import DataError, DependencyError
 
-__all__ = ["MetaworldStateEnv", "metaworld_library"]
-
 CAMERA = "corner2"
 CONTROL = ("reference", "displacement")
 #: Where the present hand, object 1 (with four more numbers), object 2 and the goal are among

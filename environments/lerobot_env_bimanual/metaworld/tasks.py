@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["DIFFICULTIES", "TASKS", "TUNED", "check_task", "difficulty"]
-
 #: Groups that publications report by (Seo et al., Masked World Models, CoRL 2022).
 DIFFICULTIES: dict[str, tuple[str, ...]] = {
     "easy": (

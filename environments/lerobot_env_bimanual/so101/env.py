@@ -33,8 +33,6 @@ from lerobot_env_bimanual.suite.task import Box
 from tpgmm_datasets.robots import bi_so101_urdf, parse_robot
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["FIGURES", "OFFSET", "OPEN", "BiSo101Env"]
-
 #: What a success needs.
 FIGURES = {
     "place_mm": Figure("from the saucer's middle [mm]", 1, high=15.0),

@@ -25,8 +25,6 @@ from lerobot_env_bimanual.so101.scene import (
 )
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["MEETING", "PHASES", "teleoperate"]
-
 #: Nominal seconds of the phases, which differ by up to a share.
 PHASES = {
     "reach": 2.2, "approach": 1.2, "close": 1.4, "lift": 1.0, "bring": 2.2, "hover": 0.4,

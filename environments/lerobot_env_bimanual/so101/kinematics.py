@@ -11,8 +11,6 @@ from lerobot_env_bimanual.so101.robot import hand_of
 from lerobot_env_bimanual.so101.scene import BiSo101Scene
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Reach"]
-
 #: Steps of Gauss and Newton, their damping, and where they end: [m] and radians alike.
 STEPS, DAMPING, CLOSE = 60, 1e-4, 1e-5
 #: A step turns no joint further [rad].

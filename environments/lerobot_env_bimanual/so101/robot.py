@@ -10,8 +10,6 @@ import numpy as np
 from lerobot_env_bimanual.robot_scene import BOX, PALM, TIMESTEP, add_geom
 from tpgmm_datasets.robots import bi_so101_urdf
 
-__all__ = ["BACKLASH", "PLAY", "SIDES", "hand_of", "so101_spec"]
-
 SIDES = ("left", "right")
 #: Of each joint, between motor and link: from one end of the free play to the other [rad].
 BACKLASH = math.radians(0.4)

@@ -24,11 +24,6 @@ from lerobot_env_bimanual.so101 import TASKS
 from lerobot_env_bimanual.so101.robot import PLAY, hand_of, so101_spec
 from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 
-__all__ = [
-    "CARRIERS", "CUP", "GRIP", "LEFT_UP", "OBJECTS", "RIGHT_UP", "SAUCER_TOP",
-    "STEM", "BiSo101Scene", "in_left_hand",
-]  # fmt: skip
-
 OBJECTS = TASKS["cup_on_saucer"]
 LEFT = Hold(hand_of("left"), "saucer", "saucer")
 RIGHT = Hold(hand_of("right"), "cup", "stem")

@@ -14,8 +14,6 @@ from lerobot_env_bimanual.so101.env import CHECKS, BiSo101Env
 from lerobot_env_bimanual.so101.robot import SIDES, hand_of
 from lerobot_env_bimanual.so101.scene import CUBE, LEFT, TAG
 
-__all__ = ["IN_HAND", "record_waving"]
-
 #: The first number of the cube of tags in each gripper.
 IN_HAND = {"left": 30, "right": 40}
 #: The joints of each arm.

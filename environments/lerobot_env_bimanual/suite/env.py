@@ -32,7 +32,7 @@ from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
+__all__ = ["SuiteEnv"]
 
 #: A grip gives way at this force [N].
 GRIP_FORCE = 100.0

@@ -34,8 +34,6 @@ from lerobot_env_bimanual.suite.task import (
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["Handover", "height", "on_stand"]
-
 RADIUS, FOOT = 0.02, 0.08
 LEFT = Hold("l_hand", "baton", "baton")
 RIGHT = Hold("r_hand", "baton", "baton")

@@ -39,8 +39,6 @@ from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
-__all__ = ["Lid"]
-
 #: Half of the box along x, y and z [m]; its origin is in its middle.
 HALF = (0.05, 0.06, 0.04)
 #: The hinge is the upper right edge, the lid's origin; the knob stands on the lid, where the

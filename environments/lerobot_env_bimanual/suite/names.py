@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["MORE", "OBSTRUCTED", "ROBOTS", "SUITE", "UPPER_BODY", "tasks_of"]
-
 #: Who does the tasks unless another is named.
 UPPER_BODY = "upper_body"
 #: How many joints each robot has.

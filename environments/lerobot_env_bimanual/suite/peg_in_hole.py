@@ -40,8 +40,6 @@ from lerobot_env_bimanual.suite.task import (
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
-__all__ = ["PegInHole"]
-
 #: The peg's radius, half its length, and its head's radius and half length [m].
 RADIUS, LENGTH, HEAD = 0.012, 0.045, (0.022, 0.015)
 #: The block, half as wide, and half as high [m].

@@ -42,8 +42,6 @@ from lerobot_env_bimanual.suite.task import (
 from tpgmm_torch import Canonical, Demonstration, Frame
 from tpgmm_torch.operators import Operator
 
-__all__ = ["SHELF", "PickPlace", "Shelf"]
-
 #: The shelf of the task ``shelf``, for the environment and for ``--policy.obstacles``.
 SHELF = Path(__file__).with_name("shelf.xml")
 #: Where stands are, in the reach of the left hand [m].

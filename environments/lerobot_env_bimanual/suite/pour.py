@@ -42,8 +42,6 @@ from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
-__all__ = ["Pour"]
-
 #: Of the cup and the jug, whose frames are in their middle: radius, and half the height [m].
 CUP, CUP_HALF = 0.03, 0.03
 JUG, JUG_HALF = 0.025, 0.06

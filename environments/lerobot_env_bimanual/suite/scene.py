@@ -14,8 +14,6 @@ import numpy as np
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.robot_scene import RobotScene, add_weld
 
-__all__ = ["OBJECT", "Hold", "SuiteScene", "add_thing"]
-
 #: What objects collide with, as a bit, beside the table: one another, but no palms.
 OBJECT = 8
 #: How a grip yields: time constant [s] and damping ratio. The lighter a thing is, the softer it

@@ -37,10 +37,7 @@ from tpgmm_torch import (
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
-__all__ = [
-    "Box", "Frames", "Judge", "Leg", "Legs", "Pose", "Style", "SuiteTask", "hands_along",
-    "raise_pose", "seen", "shift_pose", "vector",
-]  # fmt: skip
+__all__ = ["Judge", "SuiteTask"]
 
 Pose = Array
 #: Durations differ by up to this share.

@@ -15,8 +15,6 @@ from lerobot_env_bimanual.suite.task import SuiteTask
 from lerobot_env_bimanual.suite.wipe import Wipe
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["TASKS", "suite_task"]
-
 TASKS: dict[str, type[SuiteTask]] = {
     task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe, PickPlace, Shelf)
 }

@@ -37,8 +37,6 @@ from tpgmm_datasets.bottle.skill import HANDS, place_hand
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
-__all__ = ["Wipe"]
-
 #: How high the middle of the board is above the table, and half its sides and thickness [m].
 #: Its frame is in the middle of its upper side.
 FOOT = 0.06

@@ -23,9 +23,6 @@ from tpgmm_evaluation.faults.measures import Measures, false_status, measure, me
 from tpgmm_evaluation.faults.runs import simulate
 from tpgmm_evaluation.faults.skills import ROBOTS
 
-__all__ = ["main"]
-
-
 #: What is printed of a measure of several runs, and what of one run counts as bad.
 COLUMNS: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(("position", "speed", "acceleration", "jerk"), ("sum", 0)),

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from tpgmm_evaluation.faults.servos import Servo
 from tpgmm_evaluation.faults.skills import ROBOTS, Scenario, situations
 
-__all__ = ["HALVES", "KINDS", "POSES", "READINGS", "Fault", "Run"]
-
 Array = NDArray[np.float64]
 #: Of the seeds; constants are chosen on the first one alone.
 HALVES = ("development", "held-out")

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
 from tpgmm_evaluation.faults.runs import Log, Tick, simulate
 
-__all__ = ["Measures", "false_status", "measure", "measure_runs"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Measures = Mapping[str, float]

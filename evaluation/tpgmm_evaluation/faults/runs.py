@@ -14,8 +14,6 @@ from tpgmm_evaluation.faults.drawing import POSES, READINGS, Fault, Run
 from tpgmm_evaluation.faults.servos import Servos
 from tpgmm_evaluation.faults.skills import PATH_RATE
 
-__all__ = ["Log", "Tick", "simulate"]
-
 Array = NDArray[np.float64]
 #: Seconds for which a robot is looked at after it has finished.
 AFTER_END = 0.3

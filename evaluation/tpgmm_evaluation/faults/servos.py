@@ -9,8 +9,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Servo", "Servos"]
-
 Array = NDArray[np.float64]
 #: Longest step of the integration [s].
 LONGEST_STEP = 0.004

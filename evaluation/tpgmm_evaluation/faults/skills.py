@@ -19,8 +19,6 @@ from tpgmm_torch import TaskParameterizedGMM as Model
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["PATH_RATE", "ROBOTS", "Scenario", "situations"]
-
 Array = NDArray[np.float64]
 #: Of the undisturbed references [Hz].
 PATH_RATE = 50

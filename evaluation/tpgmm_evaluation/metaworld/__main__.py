@@ -41,8 +41,6 @@ from tpgmm_evaluation.report.tables import episode_table, write_table
 from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["app"]
-
 app = typer.Typer(add_completion=False)
 
 #: Whose versions are written down with each cell.

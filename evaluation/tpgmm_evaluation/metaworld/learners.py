@@ -31,8 +31,6 @@ from tpgmm_torch.skills.sequence import Sequence as SkillSequence
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.training.hold_detection import with_holds
 
-__all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "settings_of", "switches"]
-
 Rows = NDArray[np.float64]
 #: A change of the wanted opening by more than this, in a step, is a gripper that switches.
 SWITCH = 0.2

@@ -16,8 +16,6 @@ from tpgmm_torch import Canonical
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Regression
 
-__all__ = ["Nearness"]
-
 
 @dataclass(frozen=True)
 class Nearness:

@@ -21,8 +21,6 @@ from lerobot_env_bimanual.metaworld.hand import FPS, JOINTS
 from tpgmm_evaluation.baselines import RECIPES, Recipe, Training, train
 from tpgmm_evaluation.policies.episodes import Episodes, policy_stride
 
-__all__ = ["NETWORKS", "Network", "Perceptron", "features"]
-
 Rows = NDArray[np.float64]
 
 

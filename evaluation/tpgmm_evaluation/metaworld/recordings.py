@@ -12,11 +12,6 @@ from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = [
-    "demonstration_seeds", "evaluation_seeds", "read", "record_expert", "successes",
-    "validation", "validation_seeds", "write",
-]  # fmt: skip
-
 #: Demonstrations of training seed s are of the situations ``STRIDE * s`` and on.
 STRIDE = 1000
 #: Evaluations begin here, then those for tuning, then demonstrations that nothing is learned

@@ -15,11 +15,6 @@ from tpgmm_evaluation.report.significance import REFERENCE, compare_over_tasks
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, PURPLE, VERMILION
 
-__all__ = [
-    "GROUPS", "LOOKS", "comparison_table", "cost_table", "draw_groups", "panels", "summary",
-    "task_table",
-]  # fmt: skip
-
 #: Rows of the summary, and the tasks that they are about.
 GROUPS: dict[str, tuple[str, ...]] = {
     "all": TASKS,

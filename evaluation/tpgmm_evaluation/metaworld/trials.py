@@ -13,8 +13,6 @@ from lerobot_env_bimanual.metaworld.hand import FPS
 from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from tpgmm_evaluation.metaworld.learners import Actor
 
-__all__ = ["try_out"]
-
 #: Where neither hand nor objects move by more than this [m] for so many steps, nothing will
 #: happen any more: the rest of the episode is not simulated.
 STILL, STILL_STEPS = 1e-4, FPS // 2

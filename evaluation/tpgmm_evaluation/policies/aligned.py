@@ -16,8 +16,6 @@ from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.alignment.base import retime
 from tpgmm_torch.robots import Kinematics
 
-__all__ = ["Aligned"]
-
 
 @dataclass(frozen=True, eq=False)
 class Aligned:

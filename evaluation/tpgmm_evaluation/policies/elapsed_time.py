@@ -12,8 +12,6 @@ from lerobot.processor import ObservationProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-__all__ = ["ElapsedTimeStep", "tell_time", "time_features"]
-
 #: The Fourier series of an episode of this length [s], up to 1 Hz.
 LONGEST = 16.0
 HARMONICS = torch.arange(1, 17) / LONGEST

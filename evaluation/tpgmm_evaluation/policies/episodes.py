@@ -18,8 +18,6 @@ from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Episodes", "Windows", "policy_stride"]
-
 COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
 
 

@@ -29,8 +29,6 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["follow_poses", "reach"]
-
 #: How much a posture counts beside a pose, per radian and metre. More pulls links off their
 #: poses by a millimetre, much less leaves the null space to rounding.
 POSTURE_COST = 1e-3

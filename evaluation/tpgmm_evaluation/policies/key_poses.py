@@ -26,8 +26,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["KeyPose", "Move", "find_moves", "minimum_jerk_path"]
-
 #: A move has begun, or ended, up to this share of its path; minimum-jerk motions are there
 #: after this share of their time.
 STILL, EDGE = 0.01, 0.1057

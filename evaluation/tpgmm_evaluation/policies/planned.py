@@ -19,8 +19,6 @@ from tpgmm_torch import Frame
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Observed", "PlannedConfig", "PlannedPolicy", "SituatedConfig", "SituatedPolicy"]
-
 
 @dataclass
 class PlannedConfig(StatePolicyConfig):

@@ -14,8 +14,6 @@ from lerobot_policy_tpgmm.configuration_tpgmm import state_features
 from tpgmm_evaluation.policies.episodes import Episodes
 from tpgmm_evaluation.policies.planned import PlannedConfig, PlannedPolicy
 
-__all__ = ["NearestConfig", "NearestPolicy"]
-
 #: Metres that count as much as one radian of difference in orientation.
 METRES_PER_RADIAN = 0.1
 POSE = 7

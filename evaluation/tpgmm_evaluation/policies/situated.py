@@ -21,8 +21,6 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["KeyPosesConfig", "KeyPosesPolicy", "MeanConfig", "MeanPolicy"]
-
 #: For how long the present posture fades into the mean motion [s].
 FADE = 1.0
 #: Poses per second for which inverse kinematics are solved; between them lies a cubic spline.

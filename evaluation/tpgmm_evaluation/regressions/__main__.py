@@ -25,8 +25,6 @@ from tpgmm_evaluation.regressions.plan import Plan
 from tpgmm_evaluation.regressions.sections import SECTIONS, measure, measure_times
 from tpgmm_evaluation.regressions.sensitivity import sensitivity
 
-__all__ = ["main"]
-
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(

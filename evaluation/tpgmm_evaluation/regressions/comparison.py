@@ -13,8 +13,6 @@ from scipy.stats import wilcoxon
 from tpgmm_evaluation.regressions.plan import Measured
 from tpgmm_evaluation.report.significance import LEVEL, holm, mcnemar
 
-__all__ = ["Row", "compare_cells", "read_pairs", "table"]
-
 #: Rounding, relative to the largest value or to 1.
 ROUNDING = 1e-9
 #: By which share a mean may be worse though no test finds that significant.

@@ -23,8 +23,6 @@ from tpgmm_torch import (
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.robots import Poses
 
-__all__ = ["GOLDENS"]
-
 #: Situations to reproduce, and states for one batch of steps.
 SITUATIONS, STATES = 10, 64
 

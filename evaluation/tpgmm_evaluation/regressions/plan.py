@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Measured", "Plan", "import_paths"]
-
 #: Arrays by ``KIND:NAME``. The kind says how two of them are compared: ``same`` to rounding;
 #: ``success`` (0 or 1), ``score`` (more is better) and ``error`` (less is better) in pairs, the
 #: same episode, fold or situation in both; ``seconds`` by their ratio.

@@ -28,8 +28,6 @@ from tpgmm_tools.paper.experiment import BottleExperiment
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import TPGMMError
 
-__all__ = ["SECTIONS", "measure", "measure_times"]
-
 #: Real recordings beside the checkout, and what ``examples/leave_one_out.py`` calls them.
 RECORDINGS = {"g1_bottle": "g1", "honeytea_bimanual": "honeytea", "so101_record": "so101"}
 ALOHA = ("aloha_state", "aloha_insertion")

@@ -19,8 +19,6 @@ from tpgmm_evaluation.regressions.comparison import Array, compare_cells, read_p
 from tpgmm_evaluation.regressions.plan import Plan, import_paths
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["sensitivity"]
-
 
 def sensitivity(
     constant: str, plan: Plan, sections: Sequence[str], factors: Sequence[float] = (0.5, 2.0)

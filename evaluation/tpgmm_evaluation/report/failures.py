@@ -11,8 +11,6 @@ import pandas as pd
 from tpgmm_evaluation.benchmarks import Benchmark
 from tpgmm_evaluation.settings import Settings
 
-__all__ = ["criterion", "evaluation_command", "list_failures", "missed_criteria"]
-
 #: What identifies a failed episode.
 COLUMNS = ["env", "policy", "demonstrations", "training_seed", "condition", "evaluation_seed"]
 

@@ -20,10 +20,6 @@ from tpgmm_evaluation.report.significance import REFERENCE
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION, save
 
-__all__ = [
-    "draw_conditions", "draw_success", "line_of", "success_panels", "write",
-]  # fmt: skip
-
 #: What is written of each figure: vectors for print, and something small for pages.
 FORMATS = (".pdf", ".webp")
 #: Panels side by side.

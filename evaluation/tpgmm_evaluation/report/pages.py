@@ -13,11 +13,6 @@ from tpgmm_evaluation.report.tables import wilson
 from tpgmm_evaluation.variants import EVEN_CLOCK, OPEN_LOOP, Variant
 from tpgmm_torch.atomic import replacing
 
-__all__ = [
-    "by_policy", "cost_table", "describe_policy", "order_policies", "rate", "rate_of", "share",
-    "spread", "table", "write_page",
-]  # fmt: skip
-
 PHASE = "the same, informed of the time and learning from episodes on a common clock"
 #: What each policy is, in the order of the report.
 DESCRIPTIONS = {

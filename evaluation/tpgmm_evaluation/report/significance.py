@@ -12,11 +12,6 @@ from scipy.stats import binomtest, wilcoxon
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_torch.exceptions import DataError
 
-__all__ = [
-    "LEVEL", "PAIR", "PLACE", "REFERENCE", "compare_over_tasks", "compare_pairs", "holm",
-    "mcnemar", "verdict",
-]  # fmt: skip
-
 #: The policy with which the others are compared.
 REFERENCE = "tpgmm"
 #: Corrected p-values below it are called significant.

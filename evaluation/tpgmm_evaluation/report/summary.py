@@ -34,8 +34,6 @@ from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.variants import Variant
 from tpgmm_torch.atomic import replacing
 
-__all__ = ["Task", "best_others", "write_summary"]
-
 #: Share of the demonstrations that should succeed by the rules of their environment.
 ASKED = 0.98
 #: Failed episodes that the page shows; the table beside it has all.

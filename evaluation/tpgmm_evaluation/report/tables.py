@@ -14,8 +14,6 @@ from scipy.stats import binomtest
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["cell_table", "count_demonstrations", "episode_table", "wilson", "write_table"]
-
 #: What identifies a cell, in the order of the columns.
 KEYS = ("env", "policy", "demonstrations", "seed", "condition")
 

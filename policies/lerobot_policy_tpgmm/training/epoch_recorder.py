@@ -12,8 +12,6 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["EpochRecorder", "episode_ranges"]
-
 #: What is kept of a frame.
 COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
 

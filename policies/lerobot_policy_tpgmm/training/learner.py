@@ -32,8 +32,6 @@ from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.choices import aligner, learn, prepare_demonstrations
 from tpgmm_torch.training.hold_detection import holding_as_in
 
-__all__ = ["Learner"]
-
 log = logging.getLogger(__name__)
 
 

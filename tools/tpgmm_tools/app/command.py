@@ -13,7 +13,6 @@ from tpgmm_tools.arguments import options
 if TYPE_CHECKING:
     from tpgmm_tools.app.sources import Recorded
 
-__all__ = ["app"]
 
 app = typer.Typer(add_completion=False)
 

@@ -32,10 +32,6 @@ from tpgmm_torch.persistence import save
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.choices import prepare_demonstrations
 
-__all__ = [
-    "GENERATED", "UPLOADED", "Skill", "learn", "move_objects", "page", "places_of", "show",
-]  # fmt: skip
-
 GENERATED, UPLOADED = "generated: shaking a bottle with two hands", "my files"
 #: Of the choice of robots: joints alone, a file that is sent along.
 NO_ROBOT, ROBOT_FILE = "none", "my URDF or MJCF"

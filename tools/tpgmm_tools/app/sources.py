@@ -18,8 +18,6 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Recorded", "generate_bottle", "read_uploads"]
-
 #: Demonstrations, and the robot that gave them if it is known.
 Recorded = tuple[list[Demonstration], Kinematics | None]
 

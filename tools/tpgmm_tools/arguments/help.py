@@ -13,8 +13,6 @@ import typer
 from typer.core import TyperCommand
 from typer.models import ArgumentInfo
 
-__all__ = ["HELP_ALL", "Command", "Help"]
-
 WIDTH, COLUMN = 80, 26
 
 

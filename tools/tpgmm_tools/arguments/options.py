@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics
     from tpgmm_torch.skills.skill import Skill
 
-__all__ = [
-    "Alignments", "DataOptions", "RobotOptions", "SceneOptions", "align", "command",
-    "load_one_thread", "read_situations", "refuse", "show_progress",
-]  # fmt: skip
 
 #: Options that most people need: a command's ``--help`` lists those of them that it has.
 BASIC = (

@@ -7,8 +7,6 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-__all__ = ["COMMANDS", "FORMATS", "find_plugins", "load", "model_format"]
-
 #: Group of commands: a typer app or a function, added under its name.
 COMMANDS = "tpgmm.commands"
 #: Group of formats: a function of a fitted model, a folder, and the data set's signals.

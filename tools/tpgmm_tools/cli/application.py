@@ -25,8 +25,6 @@ from tpgmm_tools.cli import (
     view,
 )  # fmt: skip
 
-__all__ = ["app", "explain"]
-
 #: Commands of this package in the order of ``--help``; those of plugins follow.
 ORDER = (
     "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset",

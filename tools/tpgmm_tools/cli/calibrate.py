@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from tpgmm_vision.calibration.cell_calibration import CellCalibration, Mount
     from tpgmm_vision.cell import CellCamera
 
-__all__ = ["app"]
-
 
 app = typer.Typer(help="Calibrate cameras and cells.", add_completion=False)
 

@@ -10,8 +10,6 @@ import typer
 
 from tpgmm_tools.arguments import options
 
-__all__ = ["app"]
-
 app = typer.Typer(help="Print tags and boards for cameras.", add_completion=False)
 app.callback()(lambda: None)  # a group, though of one command
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration
 
-__all__ = ["app"]
 
 app = typer.Typer(
     help="Look at LeRobot data sets, or write one: generated, or converted.",

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics
     from tpgmm_torch.structure.choices import Choices
 
-__all__ = ["ModelOptions", "app"]
 
 app = typer.Typer()
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.operators import Operator
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["app"]
 
 app = typer.Typer()
 

@@ -8,8 +8,6 @@ import typer
 
 from tpgmm_tools.arguments import options
 
-__all__ = ["app"]
-
 app = typer.Typer()
 
 EXAMPLE = "tpgmm report out/demo/model --dataset out/demo/dataset --out out/report.html"

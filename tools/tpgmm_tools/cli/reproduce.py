@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["app"]
 
 app = typer.Typer()
 

@@ -9,8 +9,6 @@ import typer
 from tpgmm_tools.arguments import options
 from tpgmm_tools.arguments.plugins import OWN, model_format
 
-__all__ = ["app"]
-
 app = typer.Typer()
 
 EXAMPLE = 'tpgmm sequence "out/pick until held retry 2, out/home until arrived" --out out/all'

@@ -10,8 +10,6 @@ import typer
 
 from tpgmm_tools.arguments import options
 
-__all__ = ["app"]
-
 app = typer.Typer()
 
 SUFFIXES = {"html": ".html", "rerun": ".rrd"}

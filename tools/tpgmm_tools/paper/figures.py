@@ -9,8 +9,6 @@ from typing import Any
 from tpgmm_tools.plotting import BLUE, figure, legend, plot_candidates, plot_local, save, shade
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, Trajectory
 
-__all__ = ["draw_figures"]
-
 
 def draw_figures(
     out: Path,

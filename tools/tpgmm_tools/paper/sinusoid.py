@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_torch.exceptions import ShapeError
 
-__all__ = ["Sinusoid", "sinusoid"]
-
 
 @dataclass(frozen=True)
 class Sinusoid:

@@ -18,10 +18,6 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = [
-    "Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels", "turning_joints",
-]  # fmt: skip
-
 #: Of stiffness: the ellipsoids' colour, as both show the covariance.
 STIFFNESS = "#1f77b4"
 #: Of the operators; none is the reproduced path's or the ellipsoids'.

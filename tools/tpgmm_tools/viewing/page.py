@@ -29,7 +29,7 @@ from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
 
-__all__ = ["LiveView", "write_motion"]
+__all__ = ["write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0

@@ -26,11 +26,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = [
-    "COLORS", "STANDARD_DEVIATIONS", "Drawing", "Ellipsoids", "Lines", "MotionScene", "Node",
-    "ellipsoids",
-]  # fmt: skip
-
 COLORS: Mapping[str, Color] = {
     "demonstrations": (120, 120, 120),
     "reproduction": (214, 39, 40),

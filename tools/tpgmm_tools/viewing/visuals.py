@@ -24,7 +24,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import FREEDOMS, UrdfModel, parse_xml, placement, read_urdf
 
-__all__ = ["Color", "Shape", "link_shapes", "mesh", "parse_shape", "unit_ball", "whole_body"]
+__all__ = ["Shape"]
 
 Color = tuple[int, int, int]
 

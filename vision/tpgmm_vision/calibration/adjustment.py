@@ -17,8 +17,6 @@ from tpgmm_datasets.least_squares import levenberg_marquardt
 from tpgmm_vision.calibration.reprojection import Integers, Reprojection
 from tpgmm_vision.poses import Array
 
-__all__ = ["Adjustment", "Noise", "adjust"]
-
 #: Standard deviations before what is seen tells: of offsets of joints [rad], and of scales of
 #: focal lengths and of the size of tags. Makers' zeros are some degrees off, prints a percent.
 OFFSET_PRIOR, SCALE_PRIOR = np.radians(3.0), 0.03

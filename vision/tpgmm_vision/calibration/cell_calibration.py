@@ -24,7 +24,7 @@ from tpgmm_vision.detection.tags import Detections
 from tpgmm_vision.poses import Array, inverse, mean_pose, rigid
 from tpgmm_vision.targets import Target
 
-__all__ = ["CellCalibration", "Mount", "calibrate_cell"]
+__all__ = ["calibrate_cell"]
 
 #: Closed forms of OpenCV for the camera on a hand, from Tsai's to Daniilidis'; none is best.
 CLOSED_FORMS = range(5)

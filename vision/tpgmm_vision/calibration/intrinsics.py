@@ -17,7 +17,7 @@ from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.poses import Array
 from tpgmm_vision.targets import Board
 
-__all__ = ["CameraCalibration", "calibrate_camera"]
+__all__ = ["calibrate_camera"]
 
 #: Pictures at least, corners in each at least, and parts left out in turns.
 LEAST_PICTURES, LEAST_CORNERS, FOLDS = 8, 8, 4

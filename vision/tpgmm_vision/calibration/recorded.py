@@ -16,8 +16,6 @@ from tpgmm_vision.detection.tags import grey
 from tpgmm_vision.episodes.video import EpisodePictures, Picture, frames
 from tpgmm_vision.poses import Array
 
-__all__ = ["board_pictures", "slow_postures", "spread"]
-
 #: Pictures of a longer video, up to twice as many, and postures of a recording; in so many at
 #: least the robot may move faster than it should.
 FRAMES, POSTURES, LEAST_POSTURES = 40, 60, 15

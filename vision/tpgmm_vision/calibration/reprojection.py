@@ -14,8 +14,6 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.poses import Array, pose_matrix, rigid
 
-__all__ = ["Corners", "Reprojection"]
-
 Integers = NDArray[np.int_]
 
 

@@ -19,8 +19,6 @@ from tpgmm_vision.camera import Camera
 from tpgmm_vision.poses import Array, angle_between, inverse, rigid, transform
 from tpgmm_vision.targets import Target
 
-__all__ = ["PoseEstimate", "View", "estimate_pose"]
-
 #: How far what is known may be off: an upright axis [rad], the height of what stands [m].
 UPRIGHT_STD, HEIGHT_STD = np.radians(0.5), 0.001
 #: Standard deviation of corners of which no covariance is given [pixels].

@@ -28,7 +28,6 @@ from tpgmm_vision.targets import Target
 if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["TagSource", "camera_poses"]
 
 #: A camera was moved if a check is seen this far from where it is [m], so many times in a row.
 MOVED, CONFIRMED = 0.005, 3

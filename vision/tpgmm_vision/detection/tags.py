@@ -18,8 +18,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array
 from tpgmm_vision.targets import FAMILIES, modules_of
 
-__all__ = ["Detections", "TagDetector", "grey"]
-
 #: Pixels of the pattern on a side of a module, and white modules around its square.
 TEXTURE, QUIET = 8, 1
 #: What is compared reaches this far beyond the black square [modules].

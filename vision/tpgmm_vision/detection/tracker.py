@@ -9,8 +9,6 @@ import numpy as np
 from tpgmm_vision.detection.estimation import PoseEstimate
 from tpgmm_vision.poses import Array, angle_between
 
-__all__ = ["Track", "Tracker"]
-
 #: How fast objects are moved: [m/s], [rad/s].
 SPEED, TURN = 1.5, np.radians(360)
 #: How far poses of one object that stands still may be apart: [m], [rad].

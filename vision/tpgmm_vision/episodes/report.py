@@ -14,8 +14,6 @@ from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import Picture
 from tpgmm_vision.poses import Array
 
-__all__ = ["EpisodeReport", "drawn", "report_page", "table"]
-
 HEAD = (
     "episode", "object", "seen", "inferred", "unknown", "longest gap", "spread", "residual",
     "worst",

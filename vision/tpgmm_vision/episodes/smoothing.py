@@ -19,8 +19,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array, inverse, mean_pose
 
-__all__ = ["Track"]
-
 #: Poses are as far apart as three points on their axes are in the mean, which are so far from
 #: the origin: an object is about as large [m].
 LEVER = 0.05

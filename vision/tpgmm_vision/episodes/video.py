@@ -20,8 +20,6 @@ from tpgmm_datasets.lerobot.layout import Episode, Layout, episode_file
 from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_vision.poses import Array
 
-__all__ = ["EpisodePictures", "Picture", "frames"]
-
 Picture = NDArray[np.uint8]
 #: How far a picture of a video may be from the time of its row [periods]: below a half, so that
 #: no other picture is meant.

@@ -17,7 +17,7 @@ from lerobot_env_bimanual.suite.robots.viperx import viperx_posture, viperx_robo
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["Embodiment", "embodiment"]
+__all__ = ["Embodiment"]
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,6 @@ from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DependencyError
 
-__all__ = ["g1_posture", "g1_robot", "g1_spec"]
-
 PACKAGE = "example-robot-data"
 FOLDER = "cmeel.prefix/share/example-robot-data/robots/g1_description"
 URDF, MESHES = f"{FOLDER}/urdf/g1_29dof_rev_1_0.urdf", f"{FOLDER}/meshes"

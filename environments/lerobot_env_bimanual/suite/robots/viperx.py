@@ -21,8 +21,6 @@ from tpgmm_torch import Robot, quaternions
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
-__all__ = ["viperx_posture", "viperx_robot", "viperx_spec"]
-
 #: Where the left arm stands [m]; the right one is its mirror image. This, and how hands are
 #: mounted, comes from a search: how far six joints stay, in all that the experts ask for, from
 #: their ends and speeds, from stretched elbows and straight wrists.
