@@ -14,7 +14,7 @@ from tests.support import oracles
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Frame, Robot, quaternions
 from tpgmm_torch.robots import Poses, RobotState
-from tpgmm_torch.robots.robot import Kinematics
+from tpgmm_torch.robots.kinematics import Kinematics
 
 LEFT, RIGHT, OBJECT, CARRIED = "l_hand", "r_hand", "object", "bottle"
 #: How the right hand holds what it carries.
