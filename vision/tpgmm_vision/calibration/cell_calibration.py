@@ -441,10 +441,7 @@ def _check(
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")
-    links = [cameras[name].link for name in seen] + [mount.link for mount in mounts.values()]
-    _check_links(links, robot, bases)
-    if not seen or not mounts or not any(links):
-        raise DataError("no camera and no target is on a link of the robot: nothing moves")
+    _check_links(robot, seen, cameras, mounts, bases)
 
 
 def _check_detections(name: str, found: Sequence[Detections], total: int) -> None:
@@ -456,11 +453,16 @@ def _check_detections(name: str, found: Sequence[Detections], total: int) -> Non
                         "the others")  # fmt: skip
 
 
-def _check_links(links: Sequence[str | None], robot: Kinematics, bases: Sequence[str]) -> None:
-    """Refuse links that the robot lacks, and arms that are none or all of it."""
-    for link in {*links} - {None}:
-        if link not in robot.links:
-            raise UnknownNameError("link", str(link), "the robot", robot.links)
+def _check_links(
+    robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
+    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
+) -> None:  # fmt: skip
+    """Refuse links that the robot lacks, a cell without motion, and arms without a base."""
+    links = [cameras[name].link for name in seen] + [mount.link for mount in mounts.values()]
+    if unknown := {*links} - {None, *robot.links}:
+        raise UnknownNameError("link", str(unknown.pop()), "the robot", robot.links)
+    if not seen or not mounts or not any(links):
+        raise DataError("no camera and no target is on a link of the robot: nothing moves")
     for base in bases:
         if len({link.startswith(base) for link in robot.links}) < 2:
             raise DataError(f"links of an arm begin with {base!r}, not all; got {robot.links}")
