@@ -153,7 +153,7 @@ def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
 def _covariances(
     problem: Reprojection, jacobian: Array, noise: Noise, weights: Array, starts: Integers
 ) -> list[tuple[slice, Array]]:
-    """Compute the covariances of errors of corners from each of these to the next [pixels^2]."""
+    """Compute the covariances of errors of corners from each start to the next [pixels^2]."""
     moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
     variance = noise.pixels**2 / np.repeat(weights, 2)
     blocks = starmap(slice, pairwise((2 * starts).tolist()))

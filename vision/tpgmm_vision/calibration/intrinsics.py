@@ -90,7 +90,6 @@ def calibrate_camera(
     sizes = {name: picture.shape[1::-1] for name, picture in pictures.items()}
     if len(set(sizes.values())) > 1:
         raise DataError(f"pictures of one camera have one size [pixels], got {sizes}")
-    views: Views
     views, without = _views(pictures, board)
     if len(views) < LEAST_PICTURES:
         raise DataError(
@@ -116,9 +115,7 @@ def calibrate_camera(
     return CameraCalibration(camera, errors[flags], tuple(views), tuple(problems))
 
 
-def _views(
-    pictures: Mapping[str, NDArray[np.uint8]], board: Board
-) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
+def _views(pictures: Mapping[str, NDArray[np.uint8]], board: Board) -> tuple[Views, list[str]]:
     """Points of the board and their pixels in pictures that show it, and the others."""
     drawn = board.drawn
     detector, found, without = cv2.aruco.CharucoDetector(drawn), {}, list[str]()

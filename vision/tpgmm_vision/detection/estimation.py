@@ -184,7 +184,7 @@ class _Seen:
         return inverse(self.view.base_from_camera)
 
     def residual(self, pose: Array) -> tuple[Array, Array]:
-        """Compute errors (n, 8) in standard deviations, and their Jacobian by the pose (n, 8, 6)."""
+        """Compute errors (n, 8) in standard deviations, and their Jacobian (n, 8, 6)."""
         n, camera_from_base = len(self.numbers), self._from_base
         turned = self.points.reshape(-1, 3) @ pose[:3, :3].T
         points = transform(camera_from_base, turned + pose[:3, 3])
