@@ -42,6 +42,7 @@ SIGNALS = {
     "contact": ("begin", "high"),
     "release": ("end", "high"),
 }
+SIDES = {"left", "right"}
 GRAMMAR = (
     "closing:SIGNALS and opening:SIGNALS (begin and end of the longest time that a gripper is "
     "low), contact:SIGNALS and release:SIGNALS (of the longest time that a force is high, "
@@ -69,7 +70,7 @@ class Detection:
 
     @property
     def certain(self) -> bool:
-        """Whether it counts as an event."""
+        """Tell whether it counts as an event."""
         return math.isfinite(self.time) and self.confidence >= LEAST_CONFIDENCE
 
 
@@ -81,7 +82,7 @@ class Detector(abc.ABC):
 
     @abc.abstractmethod
     def find(self, demonstration: Demonstration, robot: Any = None) -> Detection:
-        """When it happens, and the confidence in that.
+        """Find when it happens, and the confidence in that.
 
         Parameters
         ----------
@@ -152,11 +153,7 @@ class SignalEvent(Detector):
         values = self._values(demonstration)
         share, contrast = between_levels(without_spikes(values, time))
         share = 1 - share if self.level == "low" else share
-        stretches = high_stretches(share, ON, 1 - ON)
-        chosen = [(start, stop) for start, stop in stretches if start > 0]
-        if self.edge == "end":
-            ended = [(start, stop) for start, stop in stretches if stop < len(share)]
-            chosen = [stretch for stretch in ended if stretch in chosen] or ended
+        chosen = self._choose_stretches(high_stretches(share, ON, 1 - ON), len(share))
         if not chosen:
             return NOTHING
         lengths = np.array([time[stop - 1] - time[start] for start, stop in chosen])
@@ -165,8 +162,18 @@ class SignalEvent(Detector):
         steepness = max(0.0, 1 - 2 * change / max(lengths[longest], 1e-9))
         return Detection(at, float(contrast * steepness * _uniqueness(lengths, longest)))
 
+    def _choose_stretches(
+        self, stretches: Sequence[tuple[int, int]], total: int
+    ) -> Sequence[tuple[int, int]]:
+        """Choose stretches whose edge is seen, and if any is, whose begin is seen too."""
+        begun = [(start, stop) for start, stop in stretches if start > 0]
+        if self.edge == "begin":
+            return begun
+        ended = [(start, stop) for start, stop in stretches if stop < total]
+        return [stretch for stretch in ended if stretch in begun] or ended
+
     def _values(self, demonstration: Demonstration) -> Array:
-        """The joints of these names, and the sizes of forces of the links of these names."""
+        """Return the joints, and the sizes of forces of the links, of these names."""
         forces = demonstration.wrenches
         names = (*(demonstration.joint_names or ()), *forces)
         sizes = [force[:, :3].norm(dim=1, keepdim=True) for force in forces.values()]
@@ -254,11 +261,7 @@ class Stop(Detector):
         position = as_array(state.position(self.link))
         speed = smooth_speed(position, time, SMOOTHING)
         peak = float(np.quantile(speed, 0.98))
-        rests = [
-            (start, stop)
-            for start, stop in high_stretches(-speed, -REST * peak, -MOTION * peak)
-            if peak > 0 and (speed[:start] > MOTION * peak).any() and stop < len(speed)
-        ]
+        rests = _find_rests(speed, peak)
         if len(rests) < (self.number or 1):
             return NOTHING
         lengths = np.array([time[stop - 1] - time[start] for start, stop in rests])
@@ -273,7 +276,7 @@ class Stop(Detector):
 def find_events(
     demonstrations: Iterable[Demonstration], events: Mapping[str, Detector], robot: Any = None
 ) -> list[Demonstration]:
-    """Demonstrations with the events that are found in them.
+    """Find events in demonstrations, and add them.
 
     Parameters
     ----------
@@ -317,7 +320,7 @@ def find_events(
 def doubtful_events(
     doubtful: Sequence[tuple[int, str, float]], among: str = "demonstration"
 ) -> list[Finding]:
-    """Findings about events that were not found, all of one name together.
+    """Report events that were not found, all of one name together.
 
     Parameters
     ----------
@@ -340,7 +343,7 @@ def doubtful_events(
 
 
 def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str, ...]:
-    """The signals of a gripper, or of a hand's fingers, known by their names.
+    """Find the signals of a gripper, or of a hand's fingers, known by their names.
 
     Parameters
     ----------
@@ -359,13 +362,9 @@ def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str,
     >>> gripper_signals(["l_elbow.pos", "l_gripper.pos", "r_gripper.pos"], "right_hand")
     ('r_gripper.pos',)
     """
-    sides = {"left", "right"}
     columns = sorted(i for group in gripper_groups(names).values() for i in group)
-    found = [names[i] for i in columns]
-    if side := sides & {*words(link or "")}:
-        own = [name for name in found if side & {*words(name)}]
-        found = own or [name for name in found if not sides & {*words(name)}]
-    if not found or {word for name in found for word in words(name)} >= sides:
+    found = _select_side([names[i] for i in columns], link or "")
+    if not found or {word for name in found for word in words(name)} >= SIDES:
         problem = f"{found} are of both hands" if found else "no signal is called a gripper's"
         raise DataError(
             f"{problem} (there are {list(names)}): say which it is, as in "
@@ -374,8 +373,16 @@ def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str,
     return tuple(found)
 
 
+def _select_side(names: Sequence[str], link: str) -> Sequence[str]:
+    """Select the names of a link's side, or where there are none, the names without a side."""
+    if not (side := SIDES & {*words(link)}):
+        return names
+    same = [name for name in names if side & {*words(name)}]
+    return same or [name for name in names if not SIDES & {*words(name)}]
+
+
 def parse_event(text: str) -> Detector:
-    """The detector that a text stands for.
+    """Make the detector that a text stands for.
 
     Parameters
     ----------
@@ -396,9 +403,9 @@ def parse_event(text: str) -> Detector:
     >>> parse_event("stop:l_hand:2")
     Stop(link='l_hand', number=2)
     """
-    kind, _, rest = (part.strip() for part in text.partition(":"))
+    kind, _, rest = map(str.strip, text.partition(":"))
     if kind in SIGNALS and rest:
-        return SignalEvent(tuple(n.strip() for n in rest.split(",")), *SIGNALS[kind])
+        return SignalEvent(tuple(map(str.strip, rest.split(","))), *SIGNALS[kind])
     if kind == "moving" and rest:
         return ObjectMoves(rest)
     if kind == "stop" and rest:
@@ -411,7 +418,7 @@ def parse_event(text: str) -> Detector:
 
 
 def usual_event(event: str, link: str, names: Sequence[str]) -> Detector | None:
-    """The detector of an event whose name says what it is: close, open or stop.
+    """Make the detector of an event whose name says what it is: close, open or stop.
 
     Parameters
     ----------
@@ -443,8 +450,17 @@ def _time(demonstration: Demonstration) -> Array:
     return as_array(demonstration.time)
 
 
+def _find_rests(speed: Array, peak: float) -> list[tuple[int, int]]:
+    """Find from which row to which a link rests between two motions."""
+    return [
+        (start, stop)
+        for start, stop in high_stretches(-speed, -REST * peak, -MOTION * peak)
+        if peak > 0 and (speed[:start] > MOTION * peak).any() and stop < len(speed)
+    ]
+
+
 def _uniqueness(lengths: Array, chosen: int) -> float:
-    """One less the second longest over the chosen of some ``lengths`` [s]."""
+    """Return one less the second longest over the chosen of some ``lengths`` [s]."""
     if lengths[chosen] <= 0:
         return 0.0
     return max(0.0, 1 - float(np.delete(lengths, chosen).max(initial=0.0) / lengths[chosen]))

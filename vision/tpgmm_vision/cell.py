@@ -141,23 +141,15 @@ class Cell:
         """Differences from another cell, in words, one for each thing."""
         found = []
         for kind in ("cameras", "objects", "checks"):
-            one, two = getattr(self, kind), getattr(other, kind)
-            for name in sorted(one.keys() | two):
-                what = f"{name!r} of the {kind}"
-                if name not in one or name not in two:
-                    found.append(f"{what} is {'missing' if name in one else 'new'}")
-                    continue
-                before, after = (cell.content[kind][name] for cell in (self, other))
-                keys = sorted({*before, *after} - {"pose", "report"})
-                if changed := [key for key in keys if before.get(key) != after.get(key)]:
-                    found.append(f"{what} has another {' and '.join(changed)}")
-                if one[name].pose is None or two[name].pose is None:
-                    continue
-                step = inverse(one[name].pose) @ two[name].pose
-                moved = 1e3 * float(np.linalg.norm(step[:3, 3]))
-                turned = math.degrees(angle_between(np.eye(4), step))
-                if moved > SAME_PLACE or turned > SAME_ANGLE:
-                    found.append(f"{what} was moved by {moved:.1f} mm and {turned:.2f} deg")
+            before, after = getattr(self, kind), getattr(other, kind)
+            for name in sorted(before.keys() | after):
+                if name not in before or name not in after:
+                    changes = [f"is {'missing' if name in before else 'new'}"]
+                else:
+                    contents = self.content[kind][name], other.content[kind][name]
+                    changes = _compare_entries(*contents)
+                    changes += _compare_poses(before[name].pose, after[name].pose)
+                found += [f"{name!r} of the {kind} {change}" for change in changes]
         return found + [
             f"joint {name!r} is offset by {math.degrees(shift):+.2f} deg more"
             for name, shift in self.shifts(other).items()
@@ -176,7 +168,7 @@ class Cell:
         return tuple(dict.fromkeys(link for link in found if link is not None))
 
     def require_placed_cameras(self) -> dict[str, CellCamera]:
-        """The cameras, all of which have a pose.
+        """Return the cameras, and refuse one without a pose.
 
         Raises
         ------
@@ -190,6 +182,25 @@ class Cell:
                 f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
             )
         return dict(self.cameras)
+
+
+def _compare_entries(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """Compare what files say of a thing, apart from its pose."""
+    keys = sorted({*before, *after} - {"pose", "report"})
+    changed = [key for key in keys if before.get(key) != after.get(key)]
+    return [f"has another {' and '.join(changed)}"] if changed else []
+
+
+def _compare_poses(before: Array | None, after: Array | None) -> list[str]:
+    """Compare the poses of a thing, where both are known."""
+    if before is None or after is None:
+        return []
+    step = inverse(before) @ after
+    moved = 1e3 * float(np.linalg.norm(step[:3, 3]))
+    turned = math.degrees(angle_between(np.eye(4), step))
+    if moved <= SAME_PLACE and turned <= SAME_ANGLE:
+        return []
+    return [f"was moved by {moved:.1f} mm and {turned:.2f} deg"]
 
 
 def check_robot(cell: Cell, robot: Any) -> None:
@@ -221,7 +232,7 @@ def check_robot(cell: Cell, robot: Any) -> None:
 
 
 def cell_of(given: Mapping[str, Any] | str | Path) -> Cell:
-    """The cell of a file, or of its content."""
+    """Return the cell of a file, or of its content."""
     return cell_from(given) if isinstance(given, Mapping) else read_cell(given)
 
 
@@ -271,7 +282,7 @@ def _format_content(content: Mapping[str, Any]) -> str:
 
 
 def cell_from(content: Any, where: str = "the cell") -> Cell:
-    """A cell of the content of its file.
+    """Make a cell of the content of its file.
 
     Raises
     ------
@@ -315,20 +326,24 @@ _Reader = Callable[[Any, str], Any]
 def _entries(
     value: Any, where: str, needed: Mapping[str, _Reader], other: Mapping[str, _Reader]
 ) -> dict[str, Any]:
-    """The entries of an object, as their readers make them."""
+    """Read the entries of an object."""
     readers = {**needed, **other}
     if not isinstance(value, Mapping):
         raise DataError(f"{where} is an object with {list(readers)}, got {value!r}")
     if extra := [name for name in value if name not in readers]:
         raise DataError(f"{where} has no entries {extra}; there are {list(readers)}")
-    there = [name for name in readers if value.get(name) is not None]
-    if missing := [name for name in needed if name not in there]:
-        raise DataError(f"{where} needs {missing[0]!r}; it has {list(value)}")
-    return {name: readers[name](value[name], f"{where}: {name}") for name in there}
+    for name in needed:
+        if value.get(name) is None:
+            raise DataError(f"{where} needs {name!r}; it has {list(value)}")
+    return {
+        name: read(value[name], f"{where}: {name}")
+        for name, read in readers.items()
+        if value.get(name) is not None
+    }
 
 
 def _mapping(reader: _Reader) -> _Reader:
-    """A reader of an object of named entries."""
+    """Make a reader of an object of named entries."""
 
     def read(value: Any, where: str) -> dict[str, Any]:
         if not isinstance(value, Mapping):
@@ -339,7 +354,7 @@ def _mapping(reader: _Reader) -> _Reader:
 
 
 def _numbers(n: int) -> _Reader:
-    """A reader of ``n`` finite numbers."""
+    """Make a reader of ``n`` finite numbers."""
 
     def read(value: Any, where: str) -> Any:
         values = value if isinstance(value, list | tuple) else [value]
@@ -353,7 +368,7 @@ def _numbers(n: int) -> _Reader:
 
 
 def _plain(kind: Any, wanted: str) -> _Reader:
-    """A reader of a value of a type that is not empty."""
+    """Make a reader of a value of a type that is not empty."""
 
     def read(value: Any, where: str) -> Any:
         if not isinstance(value, kind) or value == "":

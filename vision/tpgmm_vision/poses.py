@@ -22,7 +22,7 @@ NORM_TOLERANCE = 1e-3
 
 
 def rigid(rotation: ArrayLike, position: ArrayLike) -> Array:
-    """A pose (4, 4).
+    """Make a pose (4, 4).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def rigid(rotation: ArrayLike, position: ArrayLike) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """The inverse of poses (..., 4, 4)."""
+    """Invert poses (..., 4, 4)."""
     back = np.zeros_like(pose)
     back[..., :3, :3] = pose[..., :3, :3].swapaxes(-1, -2)
     back[..., :3, 3:] = -back[..., :3, :3] @ pose[..., :3, 3:]

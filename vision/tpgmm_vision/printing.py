@@ -89,14 +89,7 @@ def print_targets(
         If there is nothing to print, a number occurs twice, the family is not known, or
         something is too large for the page or too small to be printed.
     """
-    numbers = [*tags, *chain(*cubes)]
-    if twice := sorted({one for one in numbers if numbers.count(one) > 1}):
-        raise DataError(f"tags {twice} are asked for twice; one number belongs to one place")
-    usual = {"size": size} | ({} if family == DEFAULT_FAMILY else {"family": family})
-    single: list[dict[str, Any]] = [{"tag": int(number)} | usual for number in tags]
-    nets: list[dict[str, Any]] = [{"cube": list(map(int, one))} | usual for one in cubes]
-    for entry in single + nets:
-        target_from(entry | {"size": 1.0}, json.dumps(entry))  # sizes are checked by the page
+    single, nets = _describe_targets(tags, cubes, size, family)
     if not (single or nets or board) or page not in PAGES:
         raise DataError(
             "there are tags, cubes and a board to print (--tag, --cube, --board) on pages "
@@ -111,6 +104,21 @@ def print_targets(
         for figure in [*figures, _board(board, page)] if board else figures:
             pdf.savefig(figure)
     return single + nets
+
+
+def _describe_targets(
+    tags: Sequence[int], cubes: Sequence[Sequence[int]], size: float, family: str
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Describe tags and cubes as a cell file does, and refuse numbers that do not fit."""
+    numbers = [*tags, *chain(*cubes)]
+    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+        raise DataError(f"tags {twice} are asked for twice; one number belongs to one place")
+    usual = {"size": size} | ({} if family == DEFAULT_FAMILY else {"family": family})
+    single: list[dict[str, Any]] = [{"tag": int(number)} | usual for number in tags]
+    nets: list[dict[str, Any]] = [{"cube": list(map(int, faces))} | usual for faces in cubes]
+    for entry in single + nets:
+        target_from(entry | {"size": 1.0}, json.dumps(entry))  # sizes are checked by the page
+    return single, nets
 
 
 # Sizes are in mm from here on, and the origin of a page is its upper left corner in the margin.
@@ -133,7 +141,7 @@ def _tags(entries: Sequence[Mapping[str, Any]], page: str) -> Iterator[Any]:
 
 
 def _cube(entry: Mapping[str, Any], page: str) -> Any:
-    """The net of a cube."""
+    """Draw the net of a cube."""
     size, _, side = _sizes(entry)
     words = f"{FOLD} {side:g} mm.\n{CELL}{json.dumps(entry)}."
     axes, _ = _axes(page, words, "a cube with tags", size, side, (4, FLAP), (3, 2 * FLAP))
@@ -156,7 +164,7 @@ def _cube(entry: Mapping[str, Any], page: str) -> Any:
 
 
 def _board(board: Board, page: str) -> Any:
-    """A board."""
+    """Draw a board."""
     square, marker, drawn = board.square * 1e3, board.marker * 1e3, board.drawn
     columns, rows = drawn.getChessboardSize()
     words = (
@@ -225,7 +233,7 @@ def _axes(
 
 
 def _line(axes: Any, points: Any, **style: Any) -> None:
-    """A thin line through points."""
+    """Draw a thin line through points."""
     axes.plot(*np.array(points).T, **{"color": "0.5", "linewidth": 0.4} | style)
 
 
@@ -239,14 +247,14 @@ def _fill(axes: Any, squares: Array, size: float) -> None:
 
 
 def _tag(axes: Any, family: str, number: int, corner: Array, size: float) -> None:
-    """A tag's black modules; ``corner`` is the lower left one of its black square."""
+    """Draw a tag's black modules; ``corner`` is the lower left one of its black square."""
     count = modules_of(family)
     picture = cv2.aruco.generateImageMarker(dictionary_of(family), number, count)
     _fill(axes, corner + np.argwhere(picture[::-1] == 0)[:, ::-1] * size / count, size / count)
 
 
 def _face(axes: Any, entry: Any, number: int | None, corner: Array, words: str) -> None:
-    """A tag, if any, and the white around it, at the outer edge of which words stand."""
+    """Draw a tag, if any, and the white around it, at the outer edge of which words stand."""
     size, module, _ = _sizes(entry)
     if number is not None:
         family = entry.get("family", DEFAULT_FAMILY)

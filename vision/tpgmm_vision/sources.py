@@ -63,7 +63,7 @@ class PoseSource(Protocol):
         joints: Mapping[str, float],
         time: float,
     ) -> dict[str, ObservedPose]:
-        """The poses of all objects now.
+        """Find the poses of all objects now.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class PoseSource(Protocol):
 
 
 def pose_source(cell: Any, robot: Any = None) -> PoseSource:
-    """The source of poses that a cell names.
+    """Make the source of poses that a cell names.
 
     Parameters
     ----------

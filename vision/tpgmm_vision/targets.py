@@ -184,7 +184,7 @@ class Board:
 
 
 def target_from(entry: Mapping[str, Any], where: str = "a target") -> Target:
-    """A target as a cell file describes it.
+    """Make a target as a cell file describes it.
 
     Parameters
     ----------

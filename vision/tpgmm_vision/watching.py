@@ -107,20 +107,27 @@ class Watch:
         self._real, self._times, self._seen, self.problems = real, now, [], []
         poses = np.full((len(rows), len(self.names), 7), np.nan)
         for row in rows:
-            if row == len(self.sources):
-                self.sources.append(pose_source(self.cell, self._robot))
-            source = self.sources[row]
-            known = dict(zip(self._robot.joint_names, joints[row].tolist(), strict=True))
             here = {key: stack[row] for key, stack in pictures.items()}
-            self._seen.append(source.poses(here, known, float(now[row])))
-            self.problems.append(getattr(source, "problem", ""))
-            for k, name in enumerate(self.names):
-                one = self._seen[row].get(name)
-                if one is not None and one.valid and not self.problems[row]:
-                    poses[row, k] = one.pose
+            poses[row] = self._look_for_robot(row, here, joints[row], float(now[row]))
         poses[~np.isfinite(poses).all(-1)] = np.nan
         self._unseen = np.isnan(poses[..., 0]) * (self._unseen + elapsed[:, None])
         self._recent.append(poses)
+
+    def _look_for_robot(
+        self, row: int, pictures: Mapping[str, NDArray[np.uint8]], joints: Array, now: float
+    ) -> Array:
+        """Find the poses (n_names, 7) of objects for a robot, NaN where they are not seen."""
+        if row == len(self.sources):
+            self.sources.append(pose_source(self.cell, self._robot))
+        source, poses = self.sources[row], np.full((len(self.names), 7), np.nan)
+        known = dict(zip(self._robot.joint_names, joints.tolist(), strict=True))
+        self._seen.append(source.poses(pictures, known, now))
+        self.problems.append(getattr(source, "problem", ""))
+        for k, name in enumerate(self.names):
+            observed = self._seen[row].get(name)
+            if observed is not None and observed.valid and not self.problems[row]:
+                poses[k] = observed.pose
+        return poses
 
     def _pictures(self, name: str, images: Mapping[str, Any]) -> NDArray[np.uint8]:
         """Pictures (B, height, width, 3) of a camera."""
@@ -165,7 +172,7 @@ class Watch:
         }
 
     def _mean(self, row: int, k: int) -> Array:
-        """The mean (7,) of the last poses of an object, where they are enough."""
+        """Average the last poses (7,) of an object, where they are enough."""
         recent = [one[row, k] for one in self._recent if np.isfinite(one[row, k, 0])]
         if len(recent) < FIRST:
             return np.full(7, np.nan)
@@ -206,7 +213,7 @@ class Watch:
         }
 
     def _why(self, row: int, name: str) -> str:
-        """An object that is not seen, and why not."""
+        """Say which object is not seen, and why not."""
         seen = self._seen[row].get(name)
         reason = "its source does not know it" if seen is None else seen.reason
         return f"{name!r} ({reason})" if reason else repr(name)

@@ -151,7 +151,7 @@ def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
 def _covariances(
     problem: Reprojection, jacobian: Array, noise: Noise, weights: Array, starts: Integers
 ) -> list[tuple[slice, Array]]:
-    """The covariances of errors of the corners from each of these to the next [pixels^2]."""
+    """Compute the covariances of errors of corners from each start to the next [pixels^2]."""
     moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
     variance = noise.pixels**2 / np.repeat(weights, 2)
     blocks = starmap(slice, pairwise((2 * starts).tolist()))
@@ -197,7 +197,7 @@ def _prior_terms(problem: Reprojection, state: Array) -> tuple[Array, Array]:
 def _noise(
     problem: Reprojection, state: Array, weights: Array, given: Noise | None
 ) -> tuple[Noise, float]:
-    """The likeliest noise, or what is given, and minus the logarithm of the likelihood."""
+    """Return the likeliest or given noise, and minus the logarithm of the likelihood."""
     errors, jacobian = _errors(problem, state)
     errors, starts = errors.ravel(), _starts(problem)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -18,6 +18,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.calibration.adjustment import OFFSET_PRIOR, Adjustment, adjust
 from tpgmm_vision.calibration.reprojection import Corners, Reprojection
+from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.estimation import View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
@@ -191,46 +192,35 @@ class _Task:
         self.cameras, self.mounts, self.bases = list(seen), list(mounts), bases
         lenses = [cameras[name].camera for name in seen]
         targets, shown = [mount.target for mount in mounts.values()], list(seen.values())
-        rows = [
-            (k, i, j, number, found[k].corners[number], target.corners[number])
-            for k in range(len(joints))
-            for i, found in enumerate(shown)
-            for j, target in enumerate(targets)
-            for number in found[k].corners.keys() & target.corners.keys()
-        ]
+        rows = _collect_rows(shown, targets)
         pictures = dict.fromkeys(row[:3] for row in rows)
-        for i, name in enumerate(seen):
-            if (n := len({k for k, at, _ in pictures if at == i})) < LEAST_PICTURES:
-                raise DataError(
-                    f"camera {name!r} sees tags of {list(mounts)} in {n} of {len(joints)} "
-                    f"pictures, {LEAST_PICTURES} are needed: is it the camera that sees them, "
-                    "are their numbers right, and are they large enough in the picture (20 "
-                    "pixels an edge)?"
-                )
-        if lost := [
-            name for j, name in enumerate(mounts) if j not in {j for *_, j in pictures}
-        ]:
-            raise DataError(f"no camera sees tags of {lost}: are their numbers right?")
-        views = self.views = defaultdict[tuple[int, int], list[Any]](list)
-        for k, i, j in pictures:
-            view = View(lenses[i], np.eye(4), shown[i][k].corners)
-            if one := estimate_pose([view], targets[j]):
-                views[i, j].append((one.valid, k, one.pose))
-        for pair, found in views.items():
-            # those that cannot be trusted only where there are no others
-            good = [one for one in found if one[0]]
-            _, *columns = zip(*(good if len(good) >= LEAST_PICTURES else found), strict=True)
-            views[pair] = list(map(np.array, columns))
+        self._check_pictures(pictures, len(joints))
+        self.views = _estimate_views(pictures, lenses, targets, shown)
         *places, pixels, points = zip(*rows, strict=True)
         corners = Corners(
             np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(places), 4, 1)
         )
-        carriers = [cameras[name].link for name in seen] + [one.link for one in mounts.values()]
-        own = [{link for link in robot.links if link.startswith(base)} for base in bases]
-        self.problem = Reprojection(robot, joints, corners, lenses, carriers, own)
+        carriers = [cameras[name].link for name in seen]
+        carriers += [mount.link for mount in mounts.values()]
+        arms = [{link for link in robot.links if link.startswith(base)} for base in bases]
+        self.problem = Reprojection(robot, joints, corners, lenses, carriers, arms)
+
+    def _check_pictures(self, pictures: Iterable[tuple[int, int, int]], total: int) -> None:
+        """Refuse a camera that sees too little, and a target that no camera sees."""
+        for i, name in enumerate(self.cameras):
+            if (n := len({k for k, at, _ in pictures if at == i})) < LEAST_PICTURES:
+                raise DataError(
+                    f"camera {name!r} sees tags of {self.mounts} in {n} of {total} "
+                    f"pictures, {LEAST_PICTURES} are needed: is it the camera that sees them, "
+                    "are their numbers right, and are they large enough in the picture (20 "
+                    "pixels an edge)?"
+                )
+        found = {j for *_, j in pictures}
+        if lost := [name for j, name in enumerate(self.mounts) if j not in found]:
+            raise DataError(f"no camera sees tags of {lost}: are their numbers right?")
 
     def start(self) -> Array:
-        """The state by closed forms, pair by pair of a camera and a target."""
+        """Estimate the state by closed forms, pair by pair of a camera and a target."""
         problem, n, known = self.problem, len(self.cameras), dict[int, Array]()
         bases = np.tile(np.eye(4), (len(self.bases), 1, 1))
         links, unplaced = problem.place_links(problem.nothing)[0], set(range(len(bases)))
@@ -267,7 +257,7 @@ class _Task:
     def _closed_form(
         self, i: int, j: int, hand_from_carrier: Array, camera_from_target: Array
     ) -> tuple[Array, Array]:
-        """Poses of a camera in its carrier, and of a target in the hand."""
+        """Solve for the poses of a camera in its carrier and of a target in the hand."""
         found = list[tuple[float, Array, Array]]()
         hand, seen = hand_from_carrier[:, :3], camera_from_target[:, :3]
         for method in CLOSED_FORMS:
@@ -321,7 +311,7 @@ class _Task:
             )
 
     def _missing(self, i: int, j: int) -> str:
-        """Variety that postures lack."""
+        """Describe the variety that postures lack."""
         problem, part = self.problem, self.problem.links[len(self.cameras) + j]
         links, jacobians = problem.place_links(problem.nothing)
         used = self.views[i, j][0]
@@ -366,7 +356,7 @@ class _Task:
     def result(
         self, fit: Adjustment, unknown: NDArray[np.bool_], problems: tuple[str, ...]
     ) -> CellCalibration:
-        """The calibration, with errors on pictures left out."""
+        """Summarise the calibration, with errors on pictures left out."""
         problem, n, away = fit.problem, len(self.cameras), list[Array]()
         for fold in range(FOLDS):
             corners = problem.corners.of(problem.corners.posture % FOLDS != fold)
@@ -402,6 +392,39 @@ class _Task:
         )  # fmt: skip
 
 
+def _collect_rows(
+    shown: Sequence[Sequence[Detections]], targets: Sequence[Target]
+) -> list[tuple[int, int, int, int, Array, Array]]:
+    """Collect what pictures show: posture, camera, target and tag; pixels and points."""
+    return [
+        (k, i, j, number, found.corners[number], target.corners[number])
+        for k, at_posture in enumerate(zip(*shown, strict=True))
+        for i, found in enumerate(at_posture)
+        for j, target in enumerate(targets)
+        for number in found.corners.keys() & target.corners.keys()
+    ]
+
+
+def _estimate_views(
+    pictures: Iterable[tuple[int, int, int]],
+    lenses: Sequence[Camera],
+    targets: Sequence[Target],
+    shown: Sequence[Sequence[Detections]],
+) -> dict[tuple[int, int], list[Any]]:
+    """Estimate the poses of targets in pictures: postures and poses by camera and target."""
+    views = defaultdict[tuple[int, int], list[Any]](list)
+    for k, i, j in pictures:
+        view = View(lenses[i], np.eye(4), shown[i][k].corners)
+        if estimate := estimate_pose([view], targets[j]):
+            views[i, j].append((estimate.valid, k, estimate.pose))
+    for pair, found in views.items():
+        # poses that cannot be trusted count only where there are too few others
+        good = [row for row in found if row[0]]
+        _, *columns = zip(*(good if len(good) >= LEAST_PICTURES else found), strict=True)
+        views[pair] = list(map(np.array, columns))
+    return views
+
+
 def _check(
     joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
     cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
@@ -414,18 +437,30 @@ def _check(
     for name, found in seen.items():
         if name not in cameras:
             raise UnknownNameError("camera", name, "the cell", cameras)
-        if len(found) != len(joints):
-            raise DataError(f"camera {name!r} has {len(found)} pictures for {len(joints)} rows")
-        if twice := {k: sorted(one.twice) for k, one in enumerate(found) if one.twice}:
-            raise DataError(f"camera {name!r} sees tags twice, by picture {twice}: cover or "
-                            "remove the others")  # fmt: skip
+        _check_detections(name, found, len(joints))
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")
+    _check_links(robot, seen, cameras, mounts, bases)
+
+
+def _check_detections(name: str, found: Sequence[Detections], total: int) -> None:
+    """Refuse the tags of a camera that are not those of all pictures, or were seen twice."""
+    if len(found) != total:
+        raise DataError(f"camera {name!r} has {len(found)} pictures for {total} rows")
+    if twice := {k: sorted(tags.twice) for k, tags in enumerate(found) if tags.twice}:
+        raise DataError(f"camera {name!r} sees tags twice, by picture {twice}: cover or remove "
+                        "the others")  # fmt: skip
+
+
+def _check_links(
+    robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
+    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
+) -> None:  # fmt: skip
+    """Refuse links that the robot lacks, a cell without motion, and arms without a base."""
     links = [cameras[name].link for name in seen] + [mount.link for mount in mounts.values()]
-    for link in {*links} - {None}:
-        if link not in robot.links:
-            raise UnknownNameError("link", str(link), "the robot", robot.links)
+    if unknown := {*links} - {None, *robot.links}:
+        raise UnknownNameError("link", str(unknown.pop()), "the robot", robot.links)
     if not seen or not mounts or not any(links):
         raise DataError("no camera and no target is on a link of the robot: nothing moves")
     for base in bases:

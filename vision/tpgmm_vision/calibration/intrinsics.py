@@ -100,21 +100,11 @@ def calibrate_camera(
     size = next(iter(sizes.values()))
     _check_covered(views, size)
     fixed = cv2.CALIB_FIX_K3
-    worst = _fit_camera(views, size, fixed)[1]
-    limit = BLURRED * np.median([*worst.values()])
-    blurred = [name for name, error in worst.items() if error > limit]
-    views = {name: view for name, view in views.items() if name not in blurred}
+    views, blurred = _drop_blurred(views, size, fixed)
     errors = {flags: _left_out(views, size, flags) for flags in (fixed, 0)}
     flags = 0 if errors[0] < HELPS * errors[fixed] else fixed
     camera, _, turns, uncertain = _fit_camera(views, size, flags)
-    sides = Rotation.from_rotvec(turns).as_matrix()[:, :, 2]
-    tilt = float(np.sqrt(sides.var(axis=0).sum()))
-    if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
-        raise DataError(
-            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the "
-            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it "
-            "by 30 deg and more to the left, to the right, up and down"
-        )
+    _check_tilt(turns, uncertain)
     problems = []
     if without or blurred:
         problems.append(f"no board in {without}, a blurred one in {blurred}: they do not count")
@@ -125,9 +115,7 @@ def calibrate_camera(
     return CameraCalibration(camera, errors[flags], tuple(views), tuple(problems))
 
 
-def _views(
-    pictures: Mapping[str, NDArray[np.uint8]], board: Board
-) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
+def _views(pictures: Mapping[str, NDArray[np.uint8]], board: Board) -> tuple[Views, list[str]]:
     """Points of the board and their pixels in pictures that show it, and the others."""
     drawn = board.drawn
     detector, found, without = cv2.aruco.CharucoDetector(drawn), {}, list[str]()
@@ -157,6 +145,26 @@ def _check_covered(views: Views, size: Sequence[int]) -> None:
         raise DataError(
             f"the board was seen in {covered} of the picture's {FIELDS} x {FIELDS} fields, "
             f"{LEAST_COVERED} are needed: take pictures of it near the edges and corners"
+        )
+
+
+def _drop_blurred(views: Views, size: Sequence[int], flags: int) -> tuple[Views, list[str]]:
+    """Drop pictures that a camera explains far worse than the others; return their names."""
+    errors = _fit_camera(views, size, flags)[1]
+    limit = BLURRED * np.median([*errors.values()])
+    blurred = [name for name, error in errors.items() if error > limit]
+    return {name: view for name, view in views.items() if name not in blurred}, blurred
+
+
+def _check_tilt(turns: Array, uncertain: float) -> None:
+    """Refuse rotations of the board that do not tell the focal length."""
+    sides = Rotation.from_rotvec(turns).as_matrix()[:, :, 2]
+    tilt = float(np.sqrt(sides.var(axis=0).sum()))
+    if tilt < LEAST_TILT or uncertain > MOST_UNCERTAIN:
+        raise DataError(
+            f"the pictures do not tell the focal length (to {100 * uncertain:.1f} %): the "
+            f"board is seen from sides that differ by {np.degrees(tilt):.0f} deg only; tilt it "
+            "by 30 deg and more to the left, to the right, up and down"
         )
 
 

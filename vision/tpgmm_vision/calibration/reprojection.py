@@ -115,7 +115,7 @@ class Reprojection:
         return slice(self.offsets.stop, None)
 
     def state(self, poses: Array) -> Array:
-        """The state of poses (n_poses, 4, 4), without offsets and scales."""
+        """Return the state of poses (n_poses, 4, 4), without offsets and scales."""
         return np.concatenate((poses.ravel(), np.zeros(self.n_steps - 6 * self.n_poses)))
 
     @property
@@ -130,7 +130,7 @@ class Reprojection:
         return poses.reshape(-1, 4, 4), offsets, scales
 
     def move_state(self, state: Array, step: Array) -> Array:
-        """A state after a step: poses of cameras and targets in their own axes."""
+        """Compute a state after a step: poses of cameras and targets in their own axes."""
         poses, *_ = self.split(state)
         turns = [rigid(one[3:], one[:3]) for one in step[: self.offsets.start].reshape(-1, 6)]
         n = len(self.carriers)

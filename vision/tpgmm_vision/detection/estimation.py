@@ -167,7 +167,7 @@ class _Seen:
         )
 
     def without(self, number: int) -> _Seen:
-        """The same without a tag."""
+        """Return the same without a tag."""
         kept = [one != number for one in self.numbers]
         left = tuple(one for one in self.numbers if one != number)
         return _Seen(self.view, left, self.points[kept], self.pixels[kept], self.whiten[kept])
@@ -182,7 +182,7 @@ class _Seen:
         return inverse(self.view.base_from_camera)
 
     def residual(self, pose: Array) -> tuple[Array, Array]:
-        """The errors (n, 8) in standard deviations, and how the pose moves them (n, 8, 6)."""
+        """Compute errors (n, 8) in standard deviations, and their Jacobian (n, 8, 6)."""
         n, camera_from_base = len(self.numbers), self._from_base
         turned = self.points.reshape(-1, 3) @ pose[:3, :3].T
         points = transform(camera_from_base, turned + pose[:3, 3])
@@ -221,12 +221,12 @@ class _Problem:
         return 8 * sum(len(one.numbers) for one in self.seen) - 6
 
     def without(self, number: int) -> _Problem:
-        """The same without a tag."""
+        """Return the same without a tag."""
         left = (one.without(number) for one in self.seen)
         return _Problem(tuple(one for one in left if one.numbers))
 
     def worst(self, pose: Array) -> int:
-        """The tag that fits a pose worst."""
+        """Find the tag that fits a pose worst."""
         costs = dict.fromkeys(self.tags, 0.0)
         for one in self.seen:
             for number, errors in zip(one.numbers, one.residual(pose)[0], strict=True):
@@ -234,7 +234,7 @@ class _Problem:
         return max(costs, key=lambda number: costs[number])
 
     def best(self, known: tuple[bool, float | None] | None) -> _Fit:
-        """The hypothesis that fits best."""
+        """Fit the hypothesis that fits best."""
         guesses = [pose for one in self.seen for pose in _hypotheses(one)]
         costs = [self.system(pose, known)[0] for pose in guesses]
         order = np.argsort(costs)
@@ -310,7 +310,7 @@ class _Problem:
         return fit.cost > MOST_MISFIT**2 * self.freedom and self.residual(fit.pose) > bound
 
     def judge_fit(self, fit: _Fit, wrong: bool) -> PoseEstimate:
-        """The pose, whether it can be trusted, and if not why."""
+        """Judge whether a pose can be trusted, and if not why."""
         misfit = fit.cost / self.freedom
         inverse_information = np.linalg.pinv(fit.information, hermitian=True)
         covariance = np.asarray(inverse_information * max(misfit, 1), dtype=float)
@@ -333,7 +333,7 @@ class _Problem:
 
 
 def _hypotheses(seen: _Seen) -> list[Array]:
-    """The two poses of the target by which each of its flat tags can be explained."""
+    """Find the two poses of the target by which each of its flat tags can be explained."""
     camera, found = seen.view.camera, list[Array]()
     for points, pixels in zip(seen.points, seen.pixels, strict=True):
         size = float(np.linalg.norm(points[1] - points[0]))

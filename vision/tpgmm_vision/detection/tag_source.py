@@ -98,7 +98,7 @@ class TagSource:
         joints: Mapping[str, float],
         time: float,
     ) -> dict[str, ObservedPose]:
-        """The poses of all objects now.
+        """Find the poses of all objects now.
 
         Parameters
         ----------

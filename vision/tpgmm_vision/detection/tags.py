@@ -56,7 +56,7 @@ class Detections:
 
 
 def grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The grey values (height, width) of an RGB or grey picture.
+    """Return the grey values (height, width) of an RGB or grey picture.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class TagDetector:
         picture: NDArray[np.uint8],
         boxes: Sequence[tuple[int, int, int, int]] | None = None,
     ) -> Detections:
-        """The tags in a picture.
+        """Find the tags in a picture.
 
         Parameters
         ----------
@@ -108,6 +108,19 @@ class TagDetector:
             Where tags are looked for [pixels]; by default everywhere.
         """
         image = grey(picture)
+        rough, twice = self._search(image, boxes)
+        found = {n: self._refine(image, n, c) for n, c in rough.items() if n not in twice}
+        good = {n: fit for n, fit in found.items() if fit is not None}
+        return Detections(
+            {n: corners for n, (corners, _) in good.items()},
+            {n: covariance for n, (_, covariance) in good.items()},
+            frozenset(twice),
+        )
+
+    def _search(
+        self, image: NDArray[np.uint8], boxes: Sequence[tuple[int, int, int, int]] | None
+    ) -> tuple[dict[int, Array], set[int]]:
+        """Search boxes for tags: their corners, and the numbers found in two places."""
         height, width = image.shape
         rough: dict[int, Array] = {}
         twice = set[int]()
@@ -121,13 +134,7 @@ class TagDetector:
                 if number in rough and np.abs(rough[number] - corners).max() > 2:
                     twice.add(number)
                 rough.setdefault(number, corners)
-        found = {n: self._refine(image, n, c) for n, c in rough.items() if n not in twice}
-        good = {n: one for n, one in found.items() if one is not None}
-        return Detections(
-            {n: one[0] for n, one in good.items()},
-            {n: one[1] for n, one in good.items()},
-            frozenset(twice),
-        )
+        return rough, twice
 
     def _rough(self, image: NDArray[np.uint8]) -> list[tuple[int, Array]]:
         """Numbers and corners as OpenCV finds them."""
@@ -141,7 +148,7 @@ class TagDetector:
         return list(zip(map(int, numbers.ravel()), corners, strict=True))
 
     def _pattern(self, number: int) -> NDArray[np.float32]:
-        """The tag and white around it, 0 to 1."""
+        """Draw the tag and white around it, 0 to 1."""
         if number not in self._patterns:
             drawn = cv2.aruco.generateImageMarker(
                 self._dictionary, number, self._modules * TEXTURE
@@ -188,7 +195,7 @@ class _Fit:
         self.x, self.y = (u - self.centre[0]) / self.scale, (v - self.centre[1]) / self.scale
 
     def predict_pixels(self, corners: Array) -> NDArray[np.float32]:
-        """The pattern as it is seen with its corners there."""
+        """Predict how the pattern is seen with its corners there."""
         height, width = self.patch.shape
         fine = 3 if max(height, width) < 64 else 2 if max(height, width) < 200 else 1
         target = ((corners + 0.5) * fine - 0.5).astype(np.float32)
@@ -269,7 +276,7 @@ class _Fit:
 
 
 def _gaussian(covariance: Array) -> Array:
-    """A kernel of that covariance [pixels^2]."""
+    """Compute a kernel of that covariance [pixels^2]."""
     reach = int(np.ceil(3 * np.sqrt(float(np.diag(covariance).max()))))
     line = np.arange(-reach, reach + 1)
     (a, b), (_, c) = np.linalg.inv(covariance)

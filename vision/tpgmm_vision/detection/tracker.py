@@ -78,7 +78,7 @@ class Tracker:
         return self._last
 
     def _resolve_pose(self, found: PoseEstimate | None, time: float) -> PoseEstimate | None:
-        """The one of two poses that follows what was seen shortly before."""
+        """Choose from two poses that which follows what was seen shortly before."""
         last = self._last
         if found is None or found.alternative is None or last is None:
             return found
@@ -100,7 +100,7 @@ class Tracker:
         return away <= SPREAD + SPEED * passed and turned <= SPREAD_ANGLE + TURN * passed
 
     def _missing(self, time: float, reason: str) -> Track | None:
-        """The last pose, which is not valid."""
+        """Return the last pose, which is not valid."""
         last = self._last
         if last is None:
             return None

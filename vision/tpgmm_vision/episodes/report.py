@@ -48,7 +48,7 @@ class EpisodeReport:
     pictures: list[tuple[str, bytes]] = field(default_factory=list)
 
     def rows_to_show(self) -> dict[int, str]:
-        """The rows whose pictures say most, and what they show."""
+        """Choose the rows whose pictures say most, and what they show."""
         rows: dict[int, str] = {}
         for name, track in self.tracks.items():
             worst = int(np.where(track.seen, track.residuals, -1).argmax())
@@ -61,14 +61,14 @@ class EpisodeReport:
 
 
 def _longest_gap(track: Track) -> tuple[int, int]:
-    """The rows from which, and before which, an object was not seen for the longest time."""
+    """Find between which rows an object was not seen for the longest time."""
     marks = np.flatnonzero(np.concatenate(([True], track.seen, [True])))
     at = int(np.diff(marks).argmax())
     return int(marks[at]), int(marks[at + 1]) - 1
 
 
 def table(reports: Sequence[EpisodeReport]) -> list[tuple[str, ...]]:
-    """A line for each object in each episode, below a head."""
+    """Return a line for each object in each episode, below a head."""
     lines: list[tuple[str, ...]] = [HEAD]
     for report in reports:
         for name, track in report.tracks.items():
@@ -85,7 +85,7 @@ def table(reports: Sequence[EpisodeReport]) -> list[tuple[str, ...]]:
 
 
 def drawn(picture: Picture, seen: Mapping[int, Array], expected: Mapping[int, Array]) -> bytes:
-    """A picture (JPEG) around corners (4, 2) of tags that were seen and that were expected."""
+    """Draw a picture (JPEG) around corners (4, 2) of tags that were seen or expected."""
     height, width = picture.shape[:2]
     corner, side = np.zeros(2, int), width
     if points := [*seen.values(), *expected.values()]:
@@ -104,7 +104,7 @@ def drawn(picture: Picture, seen: Mapping[int, Array], expected: Mapping[int, Ar
 
 
 def report_page(title: str, reports: Sequence[EpisodeReport]) -> str:
-    """A page (HTML) with the table, and the pictures of each episode."""
+    """Write a page (HTML) with the table, and the pictures of each episode."""
     lines = ["".join(f"<td>{html.escape(one)}" for one in line) for line in table(reports)]
     page = f"<!doctype html><meta charset=utf-8><style>{STYLE}</style>"
     page += f"<h1>{html.escape(title)}</h1>Corners: green was seen, orange is expected."

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -87,7 +88,22 @@ class Track:
         runs = np.split(index, np.flatnonzero(np.diff(self.time[index]) > LATE) + 1)
         for run in runs[1:]:
             self.seen[run] = len(run) >= CARRIED_FRAMES  # fewer, alone for long, may be wrong
-        index = np.flatnonzero(self.seen)
+        self._fill_rests(np.flatnonzero(self.seen))
+        self._begin(hands)
+        known = np.flatnonzero(self.known)
+        for a, b in pairwise(known.tolist()):
+            if b > a + 1:
+                self._bridge(a, b, hands)
+        last = int(known[-1])
+        rest = slice(last + 1, len(self.time))
+        self.poses[rest] = self.poses[last]
+        held = [(*self._held(hand, last), hand) for hand in hands.values()]
+        count, grasp, hand = max(held, key=lambda one: one[0], default=(0, *self.poses[:2]))
+        if count and self._rest[last] < 0:
+            self._fill(rest, hand[rest] @ grasp)
+
+    def _fill_rests(self, index: NDArray[np.intp]) -> None:
+        """Find rests among the rows in which the object was seen, and fill them."""
         points, self.known = _points(self.poses[index]), self.seen.copy()
         jumps = np.linalg.norm(np.diff(points, 2, axis=0), axis=1)  # of a motion next to none
         noise = float(np.median(jumps)) / np.sqrt(6) if len(jumps) else 0.0
@@ -101,18 +117,6 @@ class Track:
             self._rest[stretch] = number
             self._fill(stretch, mean)
         self.spread = float(np.sqrt(np.concatenate(squares).mean())) if squares[1:] else 0.0
-        self._begin(hands)
-        known = np.flatnonzero(self.known)
-        for a, b in pairwise(known.tolist()):
-            if b > a + 1:
-                self._bridge(a, b, hands)
-        last = int(known[-1])
-        rest = slice(last + 1, len(self.time))
-        self.poses[rest] = self.poses[last]
-        held = [(*self._held(hand, last), hand) for hand in hands.values()]
-        count, grasp, hand = max(held, key=lambda one: one[0], default=(0, *self.poses[:2]))
-        if count and self._rest[last] < 0:
-            self._fill(rest, hand[rest] @ grasp)
 
     def _begin(self, hands: Mapping[str, Array]) -> None:
         """Fill the rows before the object was first seen."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 
+from tpgmm_datasets.conversion.assembly import Assembly
 from tpgmm_datasets.conversion.joints import joint_feature, names_of
 from tpgmm_datasets.errors import DatasetError, list_problems
 from tpgmm_datasets.lerobot import columns as kept
@@ -87,21 +88,7 @@ def track_lerobot(
     tracker = _Tracker(layout, known, robot, progress)
     assembly = open_recording(folder, robot=robot, frames={}, **reading).assembly
     offsets = _offsets(layout, known, robot, reading.get("joint_names"))
-    reports, problems = list[EpisodeReport](), list[DatasetError]()
-    for rows in read_episodes(layout, layout.episodes, assembly.features, Relaxed(())):
-        try:
-            reports.append(tracker.track(rows, assembly.demonstration(rows)))
-        except DatasetError as problem:
-            problems.append(problem)
-    if problems:
-        episodes = sorted({one.episode for one in problems if one.episode is not None})
-        raise DatasetError(
-            f"objects cannot be followed in episodes {episodes}: "
-            f"{'; '.join(list_problems(problems))}. Nothing was written. Record them again, or "
-            f"leave them out: lerobot-edit-dataset --repo_id {folder.name} --root {folder} "
-            "--new_root NEW --operation.type delete_episodes "
-            f"--operation.episode_indices '{episodes}'"
-        )
+    reports = tracker.track_all(layout, assembly)
     names, files = list(reports[0].tracks), {"meta/cell.json": content}
     files["report.html"] = report_page(f"{path}, tracked", reports)
     frames: dict[str, dict[int, Frame]] = {name: {} for name in names}
@@ -121,7 +108,7 @@ def track_lerobot(
 def _offsets(
     layout: Layout, cell: Cell, robot: Kinematics | None, joint_names: Any
 ) -> dict[str, list[float]]:
-    """The joint offsets of a cell for each value of states and actions."""
+    """Return the joint offsets of a cell for each value of states and actions."""
     declared, given = dict[str, list[float]](), cell.joint_offsets
     keys = {joint_feature(layout), kept.ACTION} & layout.features.keys()
     for key in keys if any(given.values()) else ():
@@ -141,6 +128,26 @@ class _Tracker:
         )
         self.progress, self.done = progress or (lambda done, total: None), 0
         self.total = sum(episode.length for episode in layout.episodes)
+
+    def track_all(self, layout: Layout, assembly: Assembly) -> list[EpisodeReport]:
+        """Track all episodes, and refuse a set with episodes that cannot be tracked."""
+        reports, problems = list[EpisodeReport](), list[DatasetError]()
+        for rows in read_episodes(layout, layout.episodes, assembly.features, Relaxed(())):
+            try:
+                reports.append(self.track(rows, assembly.demonstration(rows)))
+            except DatasetError as problem:
+                problems.append(problem)
+        if problems:
+            folder = layout.root
+            episodes = sorted({one.episode for one in problems if one.episode is not None})
+            raise DatasetError(
+                f"objects cannot be followed in episodes {episodes}: "
+                f"{'; '.join(list_problems(problems))}. Nothing was written. Record them "
+                f"again, or leave them out: lerobot-edit-dataset --repo_id {folder.name} "
+                f"--root {folder} --new_root NEW --operation.type delete_episodes "
+                f"--operation.episode_indices '{episodes}'"
+            )
+        return reports
 
     def track(self, rows: EpisodeRows, shown: Demonstration) -> EpisodeReport:
         """Track one episode, looking both ways in time."""

@@ -54,13 +54,7 @@ class EpisodePictures:
             message = f"the set has no pictures {missing}; its cameras are {there}. {remedy}"
             raise DatasetError(message, file="meta/info.json")
         self.videos = [key for key in keys if layout.features[key].dtype == "video"]
-        self._places = dict[tuple[str, int], list[Any]]()
-        for path in chunked_files(layout.root / "meta" / "episodes"):  # of v3.0
-            for key in self.videos:
-                columns = [f"videos/{key}/{part}" for part in PLACE]
-                table = read_columns(path, layout.root, ["episode_index", *columns])
-                for index, *place in zip(*table.to_pydict().values(), strict=True):
-                    self._places[key, index] = place
+        self._places = _read_places(layout.root, self.videos)
 
     def read(
         self, episode: Episode, time: Array, rows: Collection[int] | None = None
@@ -128,6 +122,18 @@ class EpisodePictures:
             raise _unlike(f"there are {count} images for {len(time)} rows", where)
 
 
+def _read_places(root: Path, videos: Sequence[str]) -> dict[tuple[str, int], list[Any]]:
+    """Read the :data:`PLACE` of episodes in videos of v3.0, by key and episode."""
+    places = dict[tuple[str, int], list[Any]]()
+    for path in chunked_files(root / "meta" / "episodes"):
+        for key in videos:
+            columns = [f"videos/{key}/{part}" for part in PLACE]
+            table = read_columns(path, root, ["episode_index", *columns])
+            for index, *place in zip(*table.to_pydict().values(), strict=True):
+                places[key, index] = place
+    return places
+
+
 def _unlike(problem: str, where: dict[str, Any]) -> DatasetError:
     remedy = "Was it cut, or recorded at another rate? Without its video it cannot be tracked"
     return DatasetError(f"{problem}. {remedy}", check="metadata", **where)
@@ -153,7 +159,7 @@ def frames(path: Path, start: float, where: dict[str, Any]) -> Iterator[tuple[fl
 
 
 def _decode_image(stored: Any, root: Path, where: dict[str, Any]) -> Picture:
-    """A picture as LeRobot stores images: bytes of a file, or its path."""
+    """Decode a picture as LeRobot stores images: bytes of a file, or its path."""
     content, path = (stored or {}).get("bytes"), (stored or {}).get("path")
     file = (root / (path or "")).resolve()
     if content is None and file.is_relative_to(root.resolve()) and file.is_file():
