@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -88,7 +89,25 @@ class Ceiling:
 
 
 #: Lower them with the code; an entry goes when its budget is reached.
-CEILINGS: dict[str, Ceiling] = {}
+CEILINGS: dict[str, Ceiling] = {
+    "lines of tpgmm_torch": Ceiling(11914, "0.4.0"),
+    "lines of tpgmm_control": Ceiling(4398, "0.4.0"),
+    "lines of tpgmm_datasets": Ceiling(4535, "0.4.0"),
+    "lines of tpgmm_vision": Ceiling(2715, "0.4.0"),
+    "lines of tpgmm_tools": Ceiling(3569, "0.4.0"),
+    "lines of lerobot_env_bimanual": Ceiling(5472, "0.4.0"),
+    "lines of tpgmm_evaluation": Ceiling(4809, "0.4.0"),
+    "lines of benchmarks": Ceiling(1634, "0.4.0"),
+    "lines of tests": Ceiling(35500, "0.4.0"),
+    # the loop is written anew, for one robot
+    "complex functions of run": Ceiling(6, "0.4.0"),
+    "participles of run": Ceiling(56, "0.4.0"),
+    "first lines without a verb in run": Ceiling(50, "0.4.0"),
+    "named numeric constants of run": Ceiling(74, "0.4.0"),
+    "most parameters of learn and run": Ceiling(15, "0.4.0"),  # Controller
+    "fields of a state of run": Ceiling(27, "0.4.0"),
+    "named numeric constants of learn": Ceiling(79, "0.4.0"),
+}
 
 
 class Source:
@@ -101,6 +120,14 @@ class Source:
     @property
     def lines(self) -> int:
         """Number of lines of code."""
+        return len(self._code())
+
+    def length(self, function: ast.FunctionDef) -> int:
+        """Number of lines of code of a function."""
+        return len(self._code() & {*range(function.lineno, function.end_lineno + 1)})
+
+    @cache  # noqa: B019  # sources are as many as files
+    def _code(self) -> set[int]:
         documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
         docstrings: set[int] = set()
         for node in ast.walk(self.tree):
@@ -109,14 +136,27 @@ class Source:
                 and ast.get_docstring(node, clean=False) is not None
             ):
                 docstrings |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
-        return sum(
-            bool(line.strip()) and not line.strip().startswith("#") and number not in docstrings
+        return {
+            number
             for number, line in enumerate(self.text.splitlines(), 1)
-        )
+            if line.strip() and not line.strip().startswith("#") and number not in docstrings
+        }
 
     def functions(self) -> Iterator[ast.FunctionDef]:
         """Functions and methods, however deep."""
         return (node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef))
+
+    def parameters(self) -> Iterator[int]:
+        """Numbers of parameters, but of estimators' constructors: those are settings."""
+        settings = {
+            part
+            for node in ast.walk(self.tree)
+            if isinstance(node, ast.ClassDef)
+            and any(isinstance(p, ast.FunctionDef) and p.name == "fit" for p in node.body)
+            for part in node.body
+            if isinstance(part, ast.FunctionDef) and part.name == "__init__"
+        }
+        return (_parameters(each) for each in self.functions() if each not in settings)
 
     def complex_functions(self) -> Iterator[str]:
         """Names of functions above radon's complexity 10."""
@@ -238,13 +278,11 @@ def measures() -> Mapping[str, int]:
         )
         for where, packages in parts.items()
     }
-    functions = {
-        where: [each for source in SOURCES[name] for each in source.functions()]
-        for where, name in (("learn", LEARN), ("run", RUN))
-    }
     longest = {
-        f"longest function of {where}": max(f.end_lineno - f.lineno + 1 for f in several)
-        for where, several in functions.items()
+        f"longest function of {where}": max(
+            s.length(f) for s in SOURCES[name] for f in s.functions()
+        )
+        for where, name in (("learn", LEARN), ("run", RUN))
     }
     constants = {
         f"named numeric constants of {where}": sum(len([*s.constants()]) for s in SOURCES[name])
@@ -259,7 +297,9 @@ def measures() -> Mapping[str, int]:
     }
     return {
         **lines, **counted, **longest, **constants, **_estimator(),
-        "most parameters of learn and run": max(map(_parameters, chain(*functions.values()))),
+        "most parameters of learn and run": max(
+            n for name in (LEARN, RUN) for s in SOURCES[name] for n in s.parameters()
+        ),
         "fields of a state of run": max(n for s in SOURCES[RUN] for n in _state_fields(s)),
         "modules behind the estimator": _modules_behind_the_estimator(),
         "names in tpgmm_torch.__all__": len(tpgmm_torch.__all__),
