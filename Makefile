@@ -90,7 +90,7 @@ fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of sav
 	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py \
 	    tests/tpgmm_control/loop/test_controller.py $(PYTEST_ARGS)
 
-mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
+mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=tpgmm_torch/operators
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)
 
 quality: lint types ## Check what every commit must keep, in two minutes: style, types, layers, budgets, docstrings

@@ -1,13 +1,14 @@
-"""Change a room of ``tpgmm_torch`` one expression at a time; count what its own tests notice.
+"""Change a room of learn or run one expression at a time; count what its own tests notice.
 
-``make mutants ROOM=operators``, or ``python tests/mutants.py --help``. mutmut makes the mutants
-and runs, for each, the tests of ``tests/tpgmm_torch/ROOM`` that reach the changed function; who
-survives that is tried with all of them. Everything happens on a copy, ``out/mutants/ROOM``.
+``make mutants ROOM=tpgmm_torch/operators``, or ``python tests/mutants.py --help``. mutmut makes
+the mutants and runs, for each, the tests of ``tests/ROOM`` that reach the changed function;
+what survives is tried with all of them. Everything happens on a copy, ``out/mutants/ROOM``.
 """
 
 import argparse
 import ast
 import difflib
+import json
 import os
 import random
 import re
@@ -20,16 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINKED = (
-    "tpgmm_torch",
-    "datasets",
-    "tools",
-    "vision",
-    "policies",
-    "environments",
-    "evaluation",
-    "tests",
-)
+#: Where the packages are whose rooms are changed; the other folders are linked beside them.
+HOMES = {"tpgmm_torch": "tpgmm_torch", "tpgmm_control": "control/tpgmm_control"}
+OTHERS = ("datasets", "tools", "vision", "policies", "environments", "evaluation")
 
 #: A mutant is equivalent by rule if its line is the original one once these are blanked.
 #: mutmut leaves alone annotations, docstrings, defaults other than numbers and names,
@@ -43,10 +37,10 @@ EQUIVALENT = {
 
 SETTINGS = """
 [tool.mutmut]
-source_paths = ["tpgmm_torch"]
-only_mutate = ["tpgmm_torch/{room}/*.py"]
-also_copy = ["datasets", "tools", "vision", "policies", "environments", "evaluation"]
-pytest_add_cli_args_test_selection = ["tests/tpgmm_torch/{room}"]
+source_paths = ["{package}"]
+only_mutate = ["{room}/*.py"]
+also_copy = {others}
+pytest_add_cli_args_test_selection = ["tests/{room}"]
 # the server forks tests from a process that has imported everything and run nothing
 process_isolation = "forkserver"
 timeout_constant = 20.0
@@ -79,7 +73,7 @@ def mutants(room: str) -> Iterator[Mutant]:
     from mutmut.mutation.file_mutation import mutate_file_contents
     from mutmut.utils.format_utils import get_mutant_name
 
-    for path in sorted(Path("tpgmm_torch", room).glob("*.py")):
+    for path in sorted(Path(room).glob("*.py")):
         mutated = mutate_file_contents(str(path), path.read_text(encoding="utf-8"))
         bodies = {
             function.name: lines(function)
@@ -108,10 +102,13 @@ def prepare(room: str) -> None:
     folder = ROOT / "out" / "mutants" / room
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "mutants").mkdir(parents=True)
-    for name in LINKED:
-        (folder / name).symlink_to(ROOT / name)
-    settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    (folder / "pyproject.toml").write_text(settings + SETTINGS.format(room=room), "utf-8")
+    for name, home in (HOMES | {name: name for name in (*OTHERS, "tests")}).items():
+        (folder / name).symlink_to(ROOT / home)
+    package = room.partition("/")[0]
+    others = [*OTHERS, *(name for name in HOMES if name != package)]
+    settings = SETTINGS.format(room=room, package=package, others=json.dumps(others))
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    (folder / "pyproject.toml").write_text(project + settings, "utf-8")
     os.chdir(folder)
 
 
@@ -147,7 +144,7 @@ def noticed(name: str, room: str) -> bool:
     """
     command = [sys.executable, "-m", "pytest", "-x", "-q", "--rootdir=."]
     done = subprocess.run(
-        [*command, f"tests/tpgmm_torch/{room}"],
+        [*command, f"tests/{room}"],
         cwd="mutants",
         env=environment() | {"MUTANT_UNDER_TEST": name},
         capture_output=True,
@@ -159,7 +156,11 @@ def noticed(name: str, room: str) -> bool:
 def main() -> None:
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__)
-    rooms = sorted(path.parent.name for path in ROOT.glob("tpgmm_torch/*/__init__.py"))
+    rooms = sorted(
+        f"{package}/{path.parent.name}"
+        for package, home in HOMES.items()
+        for path in ROOT.glob(f"{home}/*/__init__.py")
+    )
     parser.add_argument("room", choices=rooms)
     parser.add_argument("--sample", type=int, default=60, help="how many; 0: all of them")
     parser.add_argument("--seed", type=int, default=0)
