@@ -43,7 +43,7 @@ def tick(
     own_clocks: bool = True,
     estimate: Callable[..., Any] | None = None,
 ) -> Work:
-    """Make a tick of so many robots, 3 s after they began, or a second sooner or later.
+    """Make a tick of a batch of robots, 3 s after they began, or up to a second apart.
 
     They have caught up with the skill by some ticks, as robots on their way have.
     """

@@ -200,7 +200,7 @@ def open_recording(
 
 
 def _find_unnamed_frames(layout: Layout) -> Iterator[Finding]:
-    """Report frames that are not read, since their values cannot be told apart."""
+    """Report frames that are not read, since their values have no names."""
     objects = layout.features.get(ENVIRONMENT)
     if objects and objects.misnamed:
         message = f"no frame is read of {ENVIRONMENT!r}, {objects.misnamed}"

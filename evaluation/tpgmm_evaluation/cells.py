@@ -106,7 +106,7 @@ class Results:
         return content
 
     def has(self, cell: Cell, say: Callable[[str], None]) -> bool:
-        """Return whether a cell is finished; ``say`` is told of a damaged file, which goes."""
+        """Return whether a cell is finished; report and remove a damaged file."""
         try:
             return self.read(cell) is not None
         except DataError as error:

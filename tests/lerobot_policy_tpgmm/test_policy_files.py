@@ -103,9 +103,9 @@ def test_a_policy_of_release_0_3_with_options_of_gradient_steps_runs(directory, 
     config = json.loads(file.read_text())
     config["training"] |= {"loss": "imitation", "optimizer_lr": 1e-4}
     file.write_text(json.dumps(config))
-    told = json.loads(digests.read_text())
-    told["config.json"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    digests.write_text(json.dumps(told))
+    stored = json.loads(digests.read_text())
+    stored["config.json"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    digests.write_text(json.dumps(stored))
     old = loaded(directory, env_cfg=make_env_config("bottle_shaking"))
     assert caplog.text.count("--policy.training.loss, --policy.training.optimizer_lr: ") == 1
     assert torch.equal(act(old, batch(), 5), act(fitted(), batch(), 5))

@@ -355,7 +355,7 @@ def _rates(given: Mapping[str, str]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _number(text: str | float) -> float:
-    """Read a number in an attribute, NaN where it is none."""
+    """Read a number in an attribute; NaN if the text is no number."""
     try:
         return float(text)
     except ValueError:

@@ -30,7 +30,7 @@ MISSED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What via-points know from tick to tick.
+    """State of via-points from tick to tick.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class ViaPoints(CompositeSkill):
         if not any(cluster.counts(time) for cluster in clusters):
             memory = Memory(clusters, (None,) * len(clusters))
             return replace(free, after=replace(self, skill=skill, memory=memory))
-        if not bool(free.joints.isfinite().all()):  # of whom it cannot be told: as it was
+        if not bool(free.joints.isfinite().all()):  # no estimate: stay
             kept = free.joints if self.memory.shift is None else free.joints + self.memory.shift
             return replace(free, joints=kept, after=replace(self, skill=skill))
         given, memory = self._condition(time, free, around)

@@ -1,4 +1,4 @@
-"""What operators take from demonstrations: mean orientations, and axes of forces.
+"""Completion of operators from demonstrations: mean orientations, and axes of forces.
 
 Rotation vectors are Gaussian about the mean orientation at each instant. A force is controlled
 along the axes along which the demonstrated forces do no work.

@@ -138,7 +138,7 @@ def _check_listing(
 
 
 def _check_size(file: Path, rows: int, values: int, lengths: Collection[int]) -> None:
-    """Refuse rows of so many values that an episode would fill the memory."""
+    """Refuse rows that are too wide for an episode to fit into memory."""
     longest = max(lengths)
     if (longest + max(rows - sum(lengths), 0)) * values > MOST_IN_EPISODE:
         raise DatasetError(

@@ -26,7 +26,7 @@ TOGETHER = 16
 
 
 def measure_runs(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
-    """Simulate runs in so many processes, and measure them."""
+    """Simulate runs in several processes, and measure them."""
     groups = defaultdict(list)
     for run in runs:
         groups[run.robot, run.rate].append(run)

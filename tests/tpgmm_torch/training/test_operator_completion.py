@@ -1,4 +1,4 @@
-"""What operators take from demonstrations: mean orientations on the sphere, axes of forces."""
+"""Completion of operators from demonstrations: mean orientations, axes of forces."""
 
 import math
 from dataclasses import replace
