@@ -24,4 +24,4 @@ def __getattr__(name: str) -> object:
     """Load a public name when it is first asked for."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return globals().setdefault(name, getattr(import_module(f"{__name__}.{_HOME[name]}"), name))
