@@ -18,6 +18,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.motion.command_gaps import CommandGaps
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
@@ -386,6 +387,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         n_demonstrations: int | None = None,
         peaks: tuple[Tensor, Tensor] | None = None,
         summary: TrainingSummary | None = None,
+        gaps: CommandGaps | None = None,
         **settings: Any,
     ) -> Self:
         """Return a fitted model of known parameters, which are kept as they are.
@@ -402,6 +404,8 @@ class TaskParameterizedGMM(DemonstrationEstimator):
             Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
         summary : TrainingSummary, optional
             Of the demonstrations.
+        gaps : CommandGaps, optional
+            What servos need beyond postures.
         **settings
             Parameters of the constructor, ``robot`` among them:
             :class:`~tpgmm_torch.robots.kinematics.JointSpace` where operators need no links.
@@ -420,7 +424,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         mixture = weights, means, covariances
         learned = from_parameters(
             *mixture, time, model.get_params(deep=False),
-            holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary,
+            holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary, gaps=gaps,
         )  # fmt: skip
         return model._set(learned)
 

@@ -33,6 +33,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError, TPGMMError
+from tpgmm_torch.motion.command_gaps import CommandGaps
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -58,7 +59,7 @@ KNOWN: dict[str, type] = {
     each.__name__: each
     for each in (
         *(each for each in OPERATORS if issubclass(each, Operator)),
-        Robot, Poses, JointSpace, Hold, TrainingSummary, MotionBounds, Conditionals, Regression,
+        Robot, Poses, JointSpace, Hold, TrainingSummary, MotionBounds, CommandGaps, Conditionals, Regression,
         InformationFusion, CovarianceFusion, ViaPoint, ViaPoints, Sequence, Ways,
         TaskParameterizedGMM,
     )
@@ -298,6 +299,7 @@ def _list_arguments(thing: Any) -> dict[str, Any]:
             "learning": {name: getattr(thing, name) for name in LEARNING},
             "peaks": skill.peaks,
             "summary": skill.summary,
+            "gaps": skill.gaps,
         }  # fmt: skip
     if is_dataclass(thing):
         names = [each.name for each in fields(thing) if each.metadata.get("saved", True)]
@@ -426,6 +428,9 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
     yield "time", skill.time, (max(len(skill.time), 2),)
     for number, peak in enumerate(skill.peaks or ()):
         yield f"peaks.{number}", peak, (robot.n_joints,)
+    for name, value in vars(skill.gaps).items() if skill.gaps is not None else ():
+        shape = {"time": (len(skill.gaps.time),), "lag": (robot.n_joints,)}
+        yield f"gaps.{name}", value, shape.get(name, (len(skill.gaps.time), robot.n_joints))
     if skill.motion_bounds is not None:
         yield "motion_bounds", torch.zeros_like(skill.motion_bounds.lower), (robot.n_joints,)
     for j, (one, operator) in enumerate(zip(skill.conditionals, skill.operators, strict=True)):

@@ -80,7 +80,10 @@ def retime(
         link: torch.lerp(wrench[lower], wrench[lower + 1], fraction.to(wrench)[:, None])
         for link, wrench in demonstration.wrenches.items()
     }
-    return Demonstration(time, moved, frames, names, events, holds, wrenches)
+    commands = demonstration.commands
+    if commands is not None:
+        commands = _interpolate_joints(commands, lower, fraction, quaternion_blocks)
+    return Demonstration(time, moved, frames, names, events, holds, wrenches, commands)
 
 
 def _interpolate_joints(

@@ -104,6 +104,9 @@ class Demonstration:
         By link, the forces [N] and then the moments [N m] that the robot exerts on its
         surroundings there: at the link's origin, in the axes of the base frame, without the
         weight of the tool.
+    commands : array-like of shape (T, n_joints), optional
+        Where the joints were commanded to be at each time step [rad or m], if ``joints`` are
+        measured: what servos need beyond the postures is learned from the gap between them.
 
     Raises
     ------
@@ -131,6 +134,7 @@ class Demonstration:
     events: Mapping[str, float] = field(default_factory=dict)
     holds: tuple[Hold, ...] | None = None
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
+    commands: Tensor | None = None
 
     def __post_init__(self) -> None:
         time = _check_time(self.time)
@@ -152,7 +156,15 @@ class Demonstration:
         holds = None if self.holds is None else check_holds(self.holds, frames)
         vars(self).update(time=time, joints=joints, frames=frames, joint_names=names)
         wrenches = _check_wrenches(self.wrenches, len(time))
-        vars(self).update(events=events, holds=holds, wrenches=wrenches)
+        commands = self.commands
+        if commands is not None:
+            commands = as_tensor(commands, "commands")
+            if commands.shape != joints.shape:
+                raise ShapeError(
+                    f"commands has the shape of joints, {tuple(joints.shape)}, got "
+                    f"{tuple(commands.shape)}"
+                )
+        vars(self).update(events=events, holds=holds, wrenches=wrenches, commands=commands)
 
     def __len__(self) -> int:
         """Number of time steps T."""
@@ -211,6 +223,7 @@ class Demonstration:
             frames={n: f[chosen] if f.batch_shape else f for n, f in self.frames.items()},
             events={name: at for name, at in self.events.items() if begin <= at <= end},
             wrenches={link: wrench[chosen] for link, wrench in self.wrenches.items()},
+            commands=None if self.commands is None else self.commands[chosen],
         )
 
     def reorder(self, joint_names: Sequence[str]) -> Demonstration:
@@ -364,7 +377,10 @@ def _reorder[Given: (Demonstration, Situation)](
         if name not in present:
             raise UnknownNameError("joint", name, where, present)
     columns = [present.index(name) for name in wanted]
-    return replace(given, joints=given.joints[..., columns], joint_names=tuple(wanted))
+    changed: dict[str, Any] = {"joints": given.joints[..., columns]}
+    if isinstance(given, Demonstration) and given.commands is not None:
+        changed["commands"] = given.commands[..., columns]
+    return replace(given, joint_names=tuple(wanted), **changed)
 
 
 def check_robot(robot: Any) -> None:

@@ -20,9 +20,11 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
+from tpgmm_torch.motion.command_gaps import CommandGaps
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Linearization, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names, leaves, of_joints
@@ -115,6 +117,8 @@ class Regression:
         Distance of a situation from the demonstrations.
     time : Tensor of shape (T,), optional
         Time grid of a typical demonstration [s].
+    gaps : CommandGaps, optional
+        What servos need beyond postures.
     """
 
     kinematics: Kinematics
@@ -130,6 +134,7 @@ class Regression:
     peaks: tuple[Tensor, Tensor] | None = None
     summary: TrainingSummary | None = None
     time: Any = None
+    gaps: CommandGaps | None = None
 
     @classmethod
     def of(cls, learned: Learned, fusion: Fusion, *, moderated: bool) -> Self:
@@ -158,6 +163,7 @@ class Regression:
             peaks=learned.peaks,
             summary=learned.summary,
             time=learned.time,
+            gaps=learned.gaps,
         )
 
     def estimate(
@@ -261,6 +267,10 @@ class Regression:
                 self._likelihoods[key] = TimeLikelihood(*parts, times)
         with torch.inference_mode():
             return torch.from_numpy(self._likelihoods[key](state, frames, window))
+
+    def command_gaps(self, time: Array) -> tuple[Array, Array] | None:
+        """Return what servos need beyond postures; see :meth:`Skill.command_gaps`."""
+        return None if self.gaps is None else self.gaps.at(time)
 
     def restrict_to(self, names: frozenset[str]) -> Regression | None:
         """Return the mixture of observed operators; see :meth:`Skill.restrict_to`.

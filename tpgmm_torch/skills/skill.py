@@ -6,11 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Protocol, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
@@ -81,6 +83,21 @@ class Skill(Protocol):
     @property
     def peaks(self) -> tuple[Tensor, Tensor] | None:
         """Largest accelerations and jerks (n_joints,) of the demonstrations, or None."""
+        return None
+
+    def command_gaps(self, time: Array) -> tuple[Array, Array] | None:
+        """Return what servos need beyond postures at times; None if that is not known.
+
+        Parameters
+        ----------
+        time : array of shape (B,)
+            In the skill [s].
+
+        Returns
+        -------
+        tuple of two array of shape (B, n_joints), or None
+            As :meth:`CommandGaps.at`.
+        """
         return None
 
     @property
@@ -278,6 +295,20 @@ class CompositeSkill(Skill):
     def peaks(self) -> tuple[Tensor, Tensor] | None:
         """See :attr:`Skill.peaks`."""
         return self.representative.peaks
+
+    def command_gaps(self, time: Array) -> tuple[Array, Array] | None:
+        """See :meth:`Skill.command_gaps`: those of the skills, mixed by their shares."""
+        at = torch.from_numpy(time).to(self.kinematics.lower)
+        known = [
+            one.command_gaps(as_array(self.time_of(k, at))) for k, one in enumerate(self.skills)
+        ]
+        if all(one is None for one in known):
+            return None
+        none = np.zeros((2, len(time), self.kinematics.n_joints))
+        several = np.stack([none if one is None else np.stack(one) for one in known])
+        shares = as_array(self.shares(at).expand(len(time), -1)).T
+        gap, extent = (several * shares[:, None, :, None]).sum(0)
+        return gap, extent
 
     @property
     def summary(self) -> TrainingSummary | None:

@@ -20,6 +20,7 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.covariance_shrinkage import shrink
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments
+from tpgmm_torch.motion.command_gaps import CommandGaps, episode_gaps
 from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import of_joints
@@ -62,6 +63,8 @@ class Learned:
         Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
     summary : TrainingSummary or None
         Ranges of start postures and frames.
+    gaps : CommandGaps or None
+        What servos need beyond postures; None where no demonstration has commands.
     """
 
     mixture: BlockGaussianMixture
@@ -72,6 +75,7 @@ class Learned:
     n_demonstrations: int | None = None
     peaks: tuple[Tensor, Tensor] | None = None
     summary: TrainingSummary | None = None
+    gaps: CommandGaps | None = None
 
 
 def learn(
@@ -107,12 +111,13 @@ def learn(
     kinematics = kinematics_for(head, operators, settings["robot"], *where)
     if settings["fusion"] is not None:
         settings["fusion"].check(of_joints(operators), kinematics)
-    read: list[tuple[EpisodeSummary, Array]] = []
+    read: list[tuple[EpisodeSummary, Array, Array | None]] = []
 
     def summarize_batches() -> Iterator[Sequence[Demonstration]]:
         for batch in chain([head], batches):
-            peaks = [joint_peaks(one.reorder(kinematics.joint_names)) for one in batch]
-            read.extend(zip(summarize(batch, kinematics), peaks, strict=True))
+            ordered = [one.reorder(kinematics.joint_names) for one in batch]
+            peaks, gaps = map(joint_peaks, ordered), map(episode_gaps, ordered)
+            read.extend(zip(summarize(batch, kinematics), peaks, gaps, strict=True))
             yield batch
 
     rows = read_rows(
@@ -120,7 +125,7 @@ def learn(
         responsibilities=settings["responsibilities"], processes=processes,
     )  # fmt: skip
     rows = rows if interval is None else rows.within(*interval)
-    episodes, peaks = zip(*chain.from_iterable(processes.gather(read)), strict=True)
+    episodes, peaks, gaps = zip(*chain.from_iterable(processes.gather(read)), strict=True)
     _report(rows, episodes, kinematics, settings)
     moments = ColumnMoments.of(rows.rows, processes)
     shape = {name: settings[name] for name in ("reg_covar", "covariance_type")}
@@ -139,6 +144,7 @@ def learn(
         rows.n_demonstrations,
         typical_peaks(peaks),
         TrainingSummary.of(episodes, kinematics),
+        CommandGaps.learn(gaps, rows.time),
     )
 
 
@@ -163,7 +169,7 @@ def from_parameters(
     holds : sequence of Hold
         In the time of the skill.
     **others
-        ``n_demonstrations``, ``peaks`` and ``summary`` of :class:`Learned`.
+        ``n_demonstrations``, ``peaks``, ``summary`` and ``gaps`` of :class:`Learned`.
 
     Raises
     ------

@@ -68,6 +68,7 @@ from tpgmm_control.motion.follow import Following
 from tpgmm_control.motion.follower import Follower, Seconds
 from tpgmm_control.obstacles.avoid import Avoidance
 from tpgmm_control.obstacles.scene import Scene
+from tpgmm_control.sensing.expected_gaps import ExpectedGaps
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.servo import Flags
@@ -232,6 +233,7 @@ class Controller:
         self._needs_wrench = self._offsets is not None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
+        self._gaps = ExpectedGaps.start(skill, start, blend)
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
         self._avoidance, batch = None, len(self._progress.time)
@@ -266,6 +268,11 @@ class Controller:
         """Sent references: the ordinary ones, or those that keep clear of obstacles."""
         sent = None if self._avoidance is None else self._avoidance.sent
         return self._following if sent is None else sent
+
+    @property
+    def _wanted_posture(self) -> Tensor:
+        """Where the joints should be: the last reference, less what servos need beyond."""
+        return self.reference if self._gaps is None else self.reference - self._gaps.gap
 
     @property
     def holding(self) -> Holding:
@@ -464,13 +471,14 @@ class Controller:
         if not self._trusts and tick.joints is None:
             self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
         else:
-            reference = _rows(as_array(self.reference))
+            reference = _rows(as_array(self._wanted_posture))
             known, jumped = tick.joints, none
             readings = reference * np.nan if known is None else _rows(as_array(known))
             if self._inputs is not None:
                 jumped = self._inputs.jumped.reshape(-1)
                 still = still | self._inputs.jumping.reshape(-1)
-            seen = Seen(passed, readings, jumped, still, tick.obstructed)
+            floor = None if self._gaps is None else self._gaps.floor
+            seen = Seen(passed, readings, jumped, still, tick.obstructed, floor)
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
@@ -491,6 +499,8 @@ class Controller:
         robots = robots | self._progress.relocalized
         if robots.any():
             self._fade = self._fade.again(self._tensor(robots))
+            if self._gaps is not None:
+                self._gaps = self._gaps.restart(self._tensor(robots))
             if self._search is not None:
                 self._search = self._search.drop_robots(self._tensor(robots))
 
@@ -532,7 +542,7 @@ class Controller:
 
     def _moment(self, tick: _Tick, postures: Tensor) -> Moment:
         """State that the conditions of gates are judged by."""
-        reference, velocity = self.reference.detach(), self._following.velocity.detach()
+        reference, velocity = self._wanted_posture.detach(), self._following.velocity.detach()
         readings = torch.nan * reference if tick.joints is None else tick.joints
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
         arrived = self._tensor(self._progress.arrived(*arrays))
@@ -576,9 +586,14 @@ class Controller:
     def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
         """The posture that is wanted, and the follower there, where all robots can follow."""
         seconds = 0.0 if tick.first else _each(tick.seconds)
-        shift, self._fade = self._fade.advance(
-            self._following.reference, found.joints, seconds, tick.first
-        )
+        posture = self._wanted_posture
+        if self._avoidance is not None:
+            posture = posture + (self._following.reference - self.reference)
+        shift, self._fade = self._fade.advance(posture, found.joints, seconds, tick.first)
+        if self._gaps is not None:
+            time = np.zeros(len(self._progress.time)) + as_array(tick.time).reshape(-1)
+            self._gaps = self._gaps.advance(self._skill, time, seconds, tick.first)
+            shift = self._gaps.gap if shift is None else shift + self._gaps.gap
         wanted, fitting = self._rounded(found.joints, shift), None
         if not tick.first:
             wanted, fitting = self._nearest(tick, found, wanted, shift)
@@ -622,11 +637,11 @@ class Controller:
         """The next references, within the bounds."""
         self._found, goal, progress = found, wanted, self._progress
         if (progress.mode != RUNNING).any() and tick.joints is not None:
-            busy = self._holds.busy(wanted)
-            self._progress, led = progress.led(_rows(as_array(wanted)), busy)
+            busy, beyond = self._holds.busy(wanted), 0.0 if self._gaps is None else self._gaps.gap
+            self._progress, led = progress.led(_rows(as_array(wanted - beyond)), busy)
             alone = self._tensor(progress.mode == RUNNING).unsqueeze(-1)
             alone = alone | tick.joints.isnan()
-            goal = torch.where(alone, wanted, self._tensor(led).to(wanted))
+            goal = torch.where(alone, wanted, self._tensor(led).to(wanted) + beyond)
         halted, late = (
             None if robots is None else self._tensor(robots)
             for robots in (None if tick.first else tick.halted, tick.late)
@@ -701,8 +716,8 @@ class Controller:
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
         if not measured or tick.joints is None:
-            return self._following.reference
-        return torch.where(tick.joints.isnan(), self.reference, tick.joints)
+            return self._following.reference - (self.reference - self._wanted_posture)
+        return torch.where(tick.joints.isnan(), self._wanted_posture, tick.joints)
 
     @property
     def _is_changed(self) -> bool:
@@ -723,6 +738,8 @@ class Controller:
         joints = self._skill.kinematics.retract(joints)
         if self._following.bounds is None:
             return joints
+        if self._gaps is not None and self._limits is not None:
+            joints = joints.clamp(*self._limits)
         rounded = (joints.detach() * GRID).round() / GRID
         return joints + (rounded - joints).detach() if joints.requires_grad else rounded
 

@@ -76,6 +76,8 @@ class Seen:
         Robots for which time stands: nothing can be trusted, or time did not increase.
     obstructed : array of shape (B,), optional
         How much obstacles hold robots up: time goes on the slower, and from 1 on stands.
+    floor : array of shape (B, n_joints), optional
+        Half the gap that means nothing where the skill is [rad or m].
     """
 
     dt: Array
@@ -83,6 +85,7 @@ class Seen:
     jumped: Flags
     halted: Flags
     obstructed: Array | None = None
+    floor: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +198,10 @@ class Progress:
         """
         dt = seen.dt[:, None]
         running = (self.mode == RUNNING) & ~seen.halted
-        servo = self.servo.update(
+        servo = self.servo
+        if seen.floor is not None:
+            servo = replace_fields(servo, floor=seen.floor)
+        servo = servo.update(
             reference, seen.joints, dt, seen.jumped[:, None], running[:, None]
         )
         new = replace_fields(self, servo=servo, relocalized=np.zeros_like(self.placed))
@@ -227,7 +233,7 @@ class Progress:
         rests = np.abs(servo.reading - servo.near_reading) <= FLOOR / 10 + 2 * np.sqrt(
             servo.noise
         )
-        there = np.abs(servo.corrected - reference) <= FLOOR
+        there = np.abs(servo.corrected - reference) <= servo.floor
         there = (there & rests) | ~known
         return (there & (np.abs(velocity) <= FLOOR)).all(-1) & (self.mode == RUNNING)
 
@@ -262,7 +268,7 @@ class Progress:
     @property
     def _lead(self) -> Array:
         """Of the references of robots that are held (B, 1)."""
-        return MOTION * np.minimum(0.75 + self.since / PROBE_TIME, 2.5)[:, None]
+        return self.servo.floor * np.minimum(0.75 + self.since / PROBE_TIME, 2.5)[:, None]
 
     # Running
 
@@ -289,9 +295,8 @@ class Progress:
         servo = self.servo
         moved = np.where(known, np.abs(servo.reading - self.rest), 0.0)
         left = (moved > MOTION / 2 + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
-        asked = servo.asked(self.rest_bank) - 6 * np.sqrt(servo.noise)
-        asked = np.where(known, asked, 0.0).max(-1)
-        stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
+        asked = servo.asked(self.rest_bank) - 6 * np.sqrt(servo.noise) - 2 * servo.floor
+        stalled = waits & ~stands & ~left & (np.where(known, asked, -1.0) > 0).any(-1)
         off = ~stands & (excess > OFF) | stalled
         now = np.array((servo.reading, servo.expected))
         return replace_fields(
@@ -321,7 +326,7 @@ class Progress:
         gap = np.where(known, self.servo.corrected - self.servo.first[0], 0.0)
         stops = np.array([*self.clock.arrivals, np.inf])
         return np.where(
-            np.abs(gap).max(-1) > FLOOR,
+            (np.abs(gap) > self.servo.floor).any(-1),
             np.minimum(time, stops[stops.searchsorted(self.time)]),
             time,
         )
@@ -330,7 +335,7 @@ class Progress:
         """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
         off = self.servo.excess > OFF
         probed = (self.mode == PROBING)[:, None] & self.stuck
-        off |= probed & (np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, MOTION / 2))
+        off |= probed & (np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, self.servo.floor / 2))
         return np.isfinite(seen.joints) & off
 
     # From mode to mode

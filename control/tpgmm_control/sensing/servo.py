@@ -72,6 +72,8 @@ class Servo:
         What each lag and the offset do not explain, smoothed over half a lag; their mean.
     expected, lag : array of shape (B, n_joints)
         Expected position without offset, mean of the lag [s].
+    floor : array of shape (B, n_joints)
+        Half the gap that means nothing: friction, backlash, what contact is known to leave.
     usual : array of shape (B, n_joints)
         Size that gaps usually have at most.
     excess : array of shape (B, n_joints)
@@ -98,6 +100,7 @@ class Servo:
     gap: Array
     expected: Array
     lag: Array
+    floor: Array
     usual: Array
     excess: Array
     lead: Array
@@ -111,8 +114,8 @@ class Servo:
         return cls(
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none[:, 0], none, posture, 1e-6 * one, zero,
-            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, one,
-            zero, zero,
+            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, FLOOR * one,
+            one, zero, zero,
         )  # fmt: skip
 
     @property
@@ -196,7 +199,7 @@ class Servo:
     def _judged(self, reference: Array, weight: Array, noise: Array) -> Self:
         """How large the gaps are, beside their noise and what is not known."""
         # a part of an offset may be friction, which changes sides where a joint turns back
-        floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
+        floor = 2 * self.floor + np.minimum(np.abs(self.offset), FLOOR)
         floor = floor + 2 * np.sqrt(noise + self.variance)
         usual = floor + MODEL_ERROR * np.abs(reference - self.expected)
         possible = weight > POSSIBLE * weight.max(0)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tpgmm_datasets.conversion.joints import COMMANDED, MEASURED, JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose, MeasuredPoses
@@ -23,6 +24,7 @@ from tpgmm_datasets.lerobot.stored_signals import (
     stored_wrenches,
     wrench_features,
 )
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import pose_groups
@@ -188,7 +190,8 @@ class Assembly:
         """Features that have to be read."""
         poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
         objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        joints = [one.feature for one in (self.joints, self.measured_joints) if one]
+        several = self.joints, self.measured_joints, self.commanded_joints
+        joints = [one.feature for one in several if one]
         return [*joints, *objects, *event_features(self.layout), *wrench_features(self.layout)]
 
     @property
@@ -203,6 +206,29 @@ class Assembly:
         known = read.key in COMMANDED and isinstance(self.robot, Kinematics)
         return replace(self.joints, feature=state) if alike and known else None
 
+    @property
+    def commanded_joints(self) -> JointColumns | None:
+        """The commands of the same joints, where ``joints`` are measured."""
+        stored, read = self.layout.features, self.joints.feature
+        sent = next((stored[key] for key in COMMANDED if key in stored), read)
+        alike = read.key in MEASURED and sent.key in COMMANDED and sent.width == read.width
+        if not alike or sent.names not in (None, read.names):
+            return None
+        return replace(self.joints, feature=sent)
+
+    def _commands(self, rows: EpisodeRows, joints: Array) -> Tensor | None:
+        """Read the commands of an episode, where they are postures."""
+        sent = self.commanded_joints
+        if sent is None:
+            return None
+        try:
+            commands = sent.values(rows.values[sent.feature.key], **rows.episode.where)
+        except DatasetError:  # of other units: what they are is for whoever learns from them
+            return None
+        # differences, velocities and normalised actions explain nothing of where joints are
+        explained = (commands - joints).var(0).sum() < joints.var(0).sum()
+        return torch.from_numpy(commands) if explained else None
+
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
         where, measured = rows.episode.where, self.measured_joints
@@ -214,6 +240,7 @@ class Assembly:
             self.joints.names,
             flagged_events(rows),
             wrenches=stored_wrenches(rows),
+            commands=self._commands(rows, joints),
         )
         if measured is not None:
             joints = measured.values(rows.values[measured.feature.key], **where)

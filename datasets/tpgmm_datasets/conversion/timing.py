@@ -69,10 +69,11 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     }
     first, last = float(demonstration.time[0]), float(target[-1])
     events = {name: min(at - first, last) for name, at in demonstration.events.items()}
+    commands = None if demonstration.commands is None else linear(demonstration.commands)
     wrenches = {link: linear(wrench) for link, wrench in demonstration.wrenches.items()}
     return replace(
         demonstration, time=target, joints=joints, frames=frames, events=events,
-        wrenches=wrenches
+        wrenches=wrenches, commands=commands
     )  # fmt: skip
 
 
