@@ -142,7 +142,8 @@ def episode_gaps(demonstration: Demonstration) -> Array | None:
     Returns
     -------
     array of shape (3, INSTANTS, n_joints), or None
-        Gaps where joints rest, interpolated between [rad or m]; whether they rest; lags [s].
+        Gaps that are left where joints rest, and between [rad or m]; whether they rest; lags
+        [s].
         None without commands, or where there are too few instants.
     """
     if demonstration.commands is None or len(demonstration) < FEWEST:
@@ -152,13 +153,13 @@ def episode_gaps(demonstration: Demonstration) -> Array | None:
     speed, command_speed = (_speeds(rows, time) for rows in (joints, commands))
     gap = commands - joints
     lag = _find_lags(gap, speed, command_speed, float(np.median(np.diff(time))))
-    resting = _find_resting(time, speed, command_speed, lag)
+    slow, resting = _find_resting(time, speed, command_speed, lag)
     phases = np.linspace(time[0], time[-1], INSTANTS)
     found = np.zeros((3, INSTANTS, joints.shape[1]))
     for joint, rests in enumerate(resting.T):
         if rests.any():
-            left = gap[rests, joint] - lag[joint] * speed[rests, joint]
-            found[0, :, joint] = np.interp(phases, time[rests], left)
+            left = _fill_motion(gap[:, joint] - lag[joint] * speed[:, joint], slow[:, joint], rests)
+            found[0, :, joint] = np.interp(phases, time, left)
             found[1, :, joint] = np.interp(phases, time, rests) > 0.5
     smoothing = SMOOTHING / (phases[1] - phases[0])
     found[0] = gaussian_filter1d(found[0], smoothing, axis=0, mode="nearest")
@@ -192,13 +193,28 @@ def _find_lags(gap: Array, speed: Array, command_speed: Array, shortest: float) 
     return np.clip(lags, shortest, LONGEST_LAG)
 
 
+def _fill_motion(gap: Array, slow: NDArray[np.bool_], rests: NDArray[np.bool_]) -> Array:
+    """Replace the gaps (T,) of a joint that does not rest by those of rests before and after.
+
+    While it comes to rest it is the next one. In motion it is the smaller one: a gripper
+    presses from when it has met an object until it begins to open.
+    """
+    rows, at = np.arange(len(gap)), np.flatnonzero(rests)
+    place = np.searchsorted(at, rows)
+    following, before = at[place.clip(max=len(at) - 1)], at[(place - 1).clip(min=0)]
+    moving = np.append(np.flatnonzero(~slow), len(gap))
+    comes = slow & (place < len(at)) & (moving[np.searchsorted(moving, rows)] > following)
+    smaller = np.where(np.abs(gap[before]) < np.abs(gap[following]), before, following)
+    return gap[np.where(rests, rows, np.where(comes, following, smaller))]
+
+
 def _find_resting(
     time: Array, speed: Array, command_speed: Array, lag: Array
-) -> NDArray[np.bool_]:
-    """Find rows (T, n_joints) in which joints rest against their commands.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Find rows (T, n_joints) in which joints are slow, and rest against their commands.
 
-    They are so slow that a lag which is not quite right changes nothing, and have been for as
-    long as it takes to come to rest.
+    They are so slow that a lag which is not quite right changes nothing; they rest when they
+    have been for as long as it takes to come to rest.
     """
     fastest = np.maximum(np.abs(speed), np.abs(command_speed))
     slow = LAG_ERROR * lag * fastest < RESTING
@@ -206,4 +222,4 @@ def _find_resting(
     resting: NDArray[np.bool_] = slow & (
         time[:, None] - np.maximum.accumulate(moved, 0) > SETTLED * lag
     )
-    return resting
+    return slow, resting

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from types import MappingProxyType
@@ -45,7 +45,6 @@ class Status(StrEnum):
 FROZEN = "its readings do not change: it stands, or they are dead"
 _STATUSES = tuple(Status)
 _CODES = {status: code for code, status in enumerate(_STATUSES)}
-_NO_REASONS: Mapping[tuple[int, ...], str] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +87,7 @@ class Command:
     time: Tensor
     estimate: Estimate
     codes: Tensor
-    reasons: Mapping[tuple[int, ...], str] = _NO_REASONS
+    reasons: Mapping[tuple[int, ...], str] = field(default_factory=dict)
     impedance: Impedance | None = None
     compute_novelty: Callable[[], Tensor] | None = None
     relocalized: Tensor | None = None
@@ -254,8 +253,12 @@ def statuses(
         texts |= _waiting(progress, names, wanted, inputs)
         codes[progress.waits] = Status.WAITING.code
         codes[progress.waits & progress.displaced] = Status.DISPLACED.code
-    if ended is not None:
-        codes[ended] = Status.FINISHED.code
+    if ended is not None:  # with joints that are somewhere else, a robot has not finished
+        off = ended & progress.lasting
+        codes[ended & ~off] = Status.FINISHED.code
+        codes[off] = Status.WAITING.code
+        rows = wanted.numpy(force=True).reshape(len(off), -1)
+        texts |= {row: _gap(progress, row, names, rows) for row in np.flatnonzero(off).tolist()}
     for row, (waits, reason) in obstructed.items():
         codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
     for robots, reason in held:
@@ -267,7 +270,7 @@ def statuses(
     if halted is not None and inputs is not None:
         codes[halted] = Status.HOLDING.code
         reasons |= inputs.reasons(halted.reshape(tuple(batch)))
-    return codes, reasons or _NO_REASONS
+    return codes, reasons
 
 
 def _at_gates(

@@ -102,6 +102,9 @@ class _Tick:
     ----------
     seconds : float or array of shape (...)
         Duration of the tick, at most the longest that is trusted [s].
+    drive : float or array of shape (...)
+        The same, at most little longer than usual: a loop that stood has to be caught up with
+        gently, since drives go to each reference at once.
     late : bool array of shape (B,), optional
         Robots whose time did not increase.
     first : bool
@@ -120,6 +123,8 @@ class _Tick:
     seconds: Seconds
     late: Flags | None
     first: bool
+    drive: Seconds = 0.0
+    paused: Flags | None = None
     time: Tensor = field(init=False)
     joints: Tensor | None = None
     halted: Flags | None = None
@@ -296,9 +301,10 @@ class Controller:
 
     @property
     def finished(self) -> bool:
-        """Whether all robots are at the end: further steps hold the last reference."""
+        """Whether all robots' references are at the end: further steps hold the last ones."""
         progress = self._progress
-        return self.command is not None and bool((progress.time >= progress.end).all())
+        ended = self.command is not None and bool((progress.time >= progress.end).all())
+        return ended and bool(self._fade.done.all())
 
     def step(
         self,
@@ -404,14 +410,23 @@ class Controller:
         seconds, late = _durations(dt)
         first = self.command is None
         if first:
-            return _Tick(np.maximum(np.nan_to_num(seconds, posinf=1e-3), 1e-3), None, True)
+            seconds = np.maximum(np.nan_to_num(seconds, posinf=1e-3), 1e-3)
+            return _Tick(seconds, None, True, seconds)
         if isinstance(seconds, float) and seconds == 0:
             return None
-        if self._trusts:
-            if np.max(seconds) > 2 * LONGEST_TICK:
-                warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
-            seconds = np.minimum(seconds, LONGEST_TICK)
-        return _Tick(seconds, late, False)
+        if not self._trusts:
+            return _Tick(seconds, late, False, seconds)
+        paused = None
+        if np.max(seconds) > PAUSE:
+            warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
+            paused = np.broadcast_to(np.ravel(seconds) > PAUSE, len(self._progress.time))
+        seconds = np.minimum(seconds, LONGEST_TICK)
+        usual = self._progress.usual_dt
+        most = CATCH_UP * np.where(usual > 0, usual, np.ravel(seconds))
+        drive: Seconds = seconds
+        if (np.ravel(seconds) > most).any():
+            drive = np.minimum(seconds, most.reshape(self.reference.shape[:-1]))
+        return _Tick(seconds, late, False, drive, paused)
 
     def _sense(self, tick: _Tick, joints: Any, frames: Any, ages: Any) -> None:
         """Accepted readings, and robots that are held without them."""
@@ -424,7 +439,8 @@ class Controller:
             self._accept_places()
             self._frames, measured = self._inputs.frames, self._inputs.measured
             halted = self._inputs.untrusted(self._holds.known(self.reference))
-            tick.halted = halted.reshape(-1) if halted.any() else None
+            halted = halted.reshape(-1) if tick.paused is None else halted.reshape(-1) | tick.paused
+            tick.halted = halted if halted.any() else None
         if measured is not None and self._gripping is not None:
             # the objects that they hold keep gripping joints from their references
             measured = torch.where(self._gripping, torch.nan, measured)
@@ -482,6 +498,7 @@ class Controller:
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
+        over &= self._fade.done.numpy(force=True).reshape(-1)
         tick.ended = self._tensor(over) if over.any() else None
 
     def _obstruction(self, passed: Array) -> Array | None:
@@ -568,7 +585,7 @@ class Controller:
         operators, state = (*(one.operator for one in expected), *self._offsets.values), None
         if any(operator.frame in kinematics.links for operator in operators):
             state = kinematics.state(self._postures(tick, measured=True))
-        passed = torch.as_tensor(_each(tick.seconds)).to(self.reference)
+        passed = torch.as_tensor(_each(tick.drive)).to(self.reference)
         passed = torch.where(self._tensor(self._stands(tick)), 0.0, passed)
         self._offsets = self._offsets.advance(
             expected, self._wrenches, state, self.holding.frames, passed
@@ -585,7 +602,7 @@ class Controller:
 
     def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
         """The posture that is wanted, and the follower there, where all robots can follow."""
-        seconds = 0.0 if tick.first else _each(tick.seconds)
+        seconds = 0.0 if tick.first else _each(tick.drive)
         posture = self._wanted_posture
         if self._avoidance is not None:
             posture = posture + (self._following.reference - self.reference)
@@ -612,14 +629,17 @@ class Controller:
         if follower is None or search is None or self._limits is None:
             return wanted, None
         search = self._search or search
-        fitting = follower.take(wanted, tick.seconds) if search.active is None else None
-        if fitting is not None:
-            return wanted, fitting
+        lower, upper = self._limits
+        binds = ((found.joints <= lower) | (found.joints >= upper)).any(-1)
+        if search.active is None:
+            fitting = follower.take(wanted, tick.drive)
+            if fitting is not None or not bool(binds.any()):
+                return wanted, fitting
         joints, self._search = nearest(
-            search, follower, wanted, tick.seconds, tick.time,
+            search, follower, wanted, tick.drive, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
             found, self._limits, self._state if self._is_changed else None,
-            not self._trusts,
+            not self._trusts, binds,
         )  # fmt: skip
         return self._rounded(joints, shift), None
 
@@ -648,7 +668,7 @@ class Controller:
         )
         before = self._following.follower
         self._following = self._following.advance(
-            wanted, goal, tick.seconds, halted, late, tick.first, fitting
+            wanted, goal, tick.drive, halted, late, tick.first, fitting
         )
         if before is not None and not tick.first:
             self._avoid(tick, before)
@@ -676,7 +696,7 @@ class Controller:
         codes, reasons = commands.statuses(
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
-            ((lost, NO_ANSWER), (tick.late, NOT_INCREASED)),
+            ((lost, NO_ANSWER), (tick.late, NOT_INCREASED), (tick.paused, PAUSED)),
             tick.halted, self._inputs, self._gates, blocked,
         )  # fmt: skip
         self.command = Command(
@@ -752,11 +772,14 @@ class Controller:
         return functools.partial(_novelty, summary, self._start, first, now)
 
 
+#: A loop that stood for longer holds robots for a tick [s].
+PAUSE = 1.0
 #: Why a robot is held.
+PAUSED = "dt is more than a second: it is in seconds, and the loop must not stand for so long"
 NOT_INCREASED, NO_ANSWER = "time did not increase", "the model has no finite answer here"
 LONG_TICK = (
     "dt is more than a second: it is in seconds, not in milliseconds; after a pause of the "
-    "loop, the skill goes on as if half a second had passed"
+    "loop, the robot is held for a tick"
 )
 NO_WRENCH = (
     "the skill expects forces, and the first step has no wrench: what is measured corrects "

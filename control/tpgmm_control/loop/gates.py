@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import repeat
-from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -146,8 +145,8 @@ class Gates:
     failed: Flags
     goto: Array
     fade: Array
-    reasons: Mapping[int, str] = MappingProxyType({})
-    grips: Mapping[Hold, Grip] = MappingProxyType({})
+    reasons: Mapping[int, str] = field(default_factory=dict)
+    grips: Mapping[Hold, Grip] = field(default_factory=dict)
 
     @classmethod
     def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:

@@ -250,7 +250,7 @@ class Holds:
     watch: HoldWatch
     first: Mapping[str, float]
     given: frozenset[str] = frozenset()
-    hidden: Mapping[str, Tensor] = MappingProxyType({})
+    hidden: Mapping[str, Tensor] = field(default_factory=dict)
 
     @classmethod
     def start(cls, skill: Skill, frames: Mapping[str, Frame]) -> Self:

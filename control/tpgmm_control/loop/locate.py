@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_control.loop.clock import Clock
-from tpgmm_control.sensing.servo import FLOOR, Flags, Servo
+from tpgmm_control.sensing.servo import FLOOR, STANDSTILL, Flags, Servo
 from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
 
@@ -52,6 +52,8 @@ MOTION = FLOOR
 #: Time after which a probe that tells nothing ends, and in which the lead of a held robot's
 #: reference grows by MOTION [s].
 PROBE_TIME = 2.0
+#: Lead, in units of the motion that ends it: what is held must be able to tell that it is free.
+TELLING = 1.25
 #: Share of the lead of robots that hold an object, which they would lose with a jerk.
 CAREFUL = 1 / 3
 #: Time that a stopped robot has missed, from when on it is done again [s].
@@ -177,10 +179,10 @@ class Progress:
     @property
     def waits(self) -> Flags:
         """Robots that are waited for."""
-        return (self._lasting | (self.mode != RUNNING)) & (self.time < self.end)
+        return (self.lasting | (self.mode != RUNNING)) & (self.time < self.end)
 
     @property
-    def _lasting(self) -> Flags:
+    def lasting(self) -> Flags:
         """Robots that have been off for more than a moment."""
         return self.off_for > np.maximum(DWELL, 2 * self.usual_dt)
 
@@ -260,6 +262,7 @@ class Progress:
             Robots that hold an object.
         """
         lead = np.where(careful, CAREFUL, 1.0)[:, None] * self._lead
+        lead = np.maximum(lead, TELLING * self._motion_of_held)
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
         goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
@@ -269,6 +272,12 @@ class Progress:
     def _lead(self) -> Array:
         """Of the references of robots that are held (B, 1)."""
         return self.servo.floor * np.minimum(0.75 + self.since / PROBE_TIME, 2.5)[:, None]
+
+    @property
+    def _motion_of_held(self) -> Array:
+        """From which on joints (B, n_joints) that were held have moved, beside their noise."""
+        averaged = np.minimum(1.0, self.usual_dt / (2 * STANDSTILL))[:, None]
+        return self.servo.floor / 2 + 3 * np.sqrt(2 * self.servo.noise * averaged)
 
     # Running
 
@@ -286,9 +295,11 @@ class Progress:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
         rate = np.where(stands, seen.halted * self.rate, rate)
         usual = np.where(self.usual_dt > 0, self.usual_dt, seen.dt)
-        usual = usual + 0.1 * (np.minimum(seen.dt, 2 * usual) - usual)
+        usual = np.where(
+            seen.halted, self.usual_dt, usual + 0.1 * (np.minimum(seen.dt, 2 * usual) - usual)
+        )
         owed = np.where(stands, 0.0, self.owed + seen.dt)
-        step = np.minimum(owed, CATCH_UP * usual)
+        step = np.minimum(owed, CATCH_UP * np.where(usual > 0, usual, seen.dt))
         owed = np.where(rate < 1, 0.0, owed - step)
         step = np.where(stands, 0.0, self.clock.speed * rate * step)
         time = self._arrived(self._until_end(step), known)
@@ -367,7 +378,7 @@ class Progress:
     def _noticed(self, reference: Array, seen: Seen, find: Find) -> Self:
         """Robots that do not follow, and are probed."""
         off = self._off(seen)
-        late = self._lasting | (seen.jumped & (off.sum(-1) > 0))
+        late = self.lasting | (seen.jumped & (off.sum(-1) > 0))
         settled = self.since > RESTART + 4 * np.where(off, self.servo.lag, 0.0).max(-1)
         rows = late & settled & (self.mode == RUNNING) & (self.time < self.end) & ~seen.halted
         if not rows.any():
@@ -415,7 +426,7 @@ class Progress:
         target = np.where(known, servo.corrected, reference)
         new = replace_fields(
             new._switched(held, HELD, target),
-            reading=np.where(held[:, None], servo.reading, new.reading),
+            reading=np.where(held[:, None], servo.near_reading, new.reading),
         )
         new = new._placed(held & self.displaced, known, find)
         return new._switched(held & new.placed, RUNNING, target)
@@ -423,8 +434,8 @@ class Progress:
     def _released(self, seen: Seen) -> Self:
         """Robots that were held, and move again: what they missed is done then."""
         stuck = np.isfinite(seen.joints) & self.stuck
-        way = np.where(stuck, np.abs(self.servo.reading - self.reading), 0.0)
-        moved = (way > MOTION / 2 + 3 * np.sqrt(self.servo.noise)).any(-1)
+        way = np.where(stuck, np.abs(self.servo.near_reading - self.reading), 0.0)
+        moved = (way > self._motion_of_held).any(-1)
         # as far as it is led it may stick: from where nothing more is wanted, time goes on
         there = (~stuck | (np.abs(self.wanted - self.target) < self._lead)).all(-1)
         rows = (self.mode == HELD) & (moved | there) & ~seen.halted

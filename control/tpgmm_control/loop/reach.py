@@ -51,6 +51,11 @@ class Fade:
         passed = zero - 1 if blend > 0 else zero + torch.inf
         return cls(blend, torch.zeros_like(joints), passed, zero + blend, blend <= 0)
 
+    @property
+    def done(self) -> Tensor:
+        """Robots (...) of which nothing is left."""
+        return self.passed >= self.duration
+
     def again(self, robots: Tensor, longest: float | Tensor | None = None) -> Self:
         """Some robots (...) go on from where their references are.
 
