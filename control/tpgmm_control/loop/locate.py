@@ -52,6 +52,8 @@ MOTION = FLOOR
 #: Time after which a probe that tells nothing ends, and in which the lead of a held robot's
 #: reference grows by MOTION [s].
 PROBE_TIME = 2.0
+#: The largest lead of what is held [rad or m].
+MOST_LEAD = 0.15
 #: Lead, in units of the motion that ends it: what is held must be able to tell that it is free.
 TELLING = 1.25
 #: Share of the lead of robots that hold an object, which they would lose with a jerk.
@@ -271,7 +273,8 @@ class Progress:
     @property
     def _lead(self) -> Array:
         """Of the references of robots that are held (B, 1)."""
-        return self.servo.floor * np.minimum(0.75 + self.since / PROBE_TIME, 2.5)[:, None]
+        lead = self.servo.floor * (0.75 + self.since / PROBE_TIME)[:, None]
+        return np.minimum(lead, MOST_LEAD)
 
     @property
     def _motion_of_held(self) -> Array:

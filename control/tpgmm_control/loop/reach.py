@@ -117,6 +117,7 @@ def nearest(
     bounds: tuple[Tensor, Tensor],
     state_at: Callable[[Tensor], RobotState] | None,
     raises: bool,
+    binds: Tensor,
 ) -> tuple[Tensor, PostureSearch]:
     """The nearest postures where an estimate, one linearised step, leads too far.
 
@@ -134,13 +135,16 @@ def nearest(
         As for :meth:`PostureSearch.advance`.
     raises : bool
         Whether errors are raised; else the estimate stands.
+    binds : Tensor of bool of shape (...)
+        Robots whose estimate is at a limit of position: for speed, acceleration and jerk the
+        follower answers.
 
     Raises
     ------
     TPGMMError
         As the skill does.
     """
-    asked = ~follower.fits(wanted, dt) & wanted.isfinite().all(-1)
+    asked = binds & ~follower.fits(wanted, dt) & wanted.isfinite().all(-1)
     try:
         return search.advance(time, state, frames, estimate, bounds, asked, state_at)
     except TPGMMError:
