@@ -158,7 +158,9 @@ def episode_gaps(demonstration: Demonstration) -> Array | None:
     found = np.zeros((3, INSTANTS, joints.shape[1]))
     for joint, rests in enumerate(resting.T):
         if rests.any():
-            left = _fill_motion(gap[:, joint] - lag[joint] * speed[:, joint], slow[:, joint], rests)
+            left = _fill_motion(
+                gap[:, joint] - lag[joint] * speed[:, joint], slow[:, joint], rests
+            )
             found[0, :, joint] = np.interp(phases, time, left)
             found[1, :, joint] = np.interp(phases, time, rests) > 0.5
     smoothing = SMOOTHING / (phases[1] - phases[0])
@@ -175,18 +177,21 @@ def _speeds(rows: Array, time: Array) -> Array:
 def _find_lags(gap: Array, speed: Array, command_speed: Array, shortest: float) -> Array:
     """Find how late joints are [s]: median of gaps over speeds, weighted by speeds.
 
-    Rows count in which joint and command move alike: a command that leaps tells how quick the
-    one was who gave it.
+    Rows count in which joint and command move alike. Where a command only leaps, the lag is
+    what the gap adds up to over time, as a share of the way.
     """
     lags = np.full(gap.shape[1], shortest)
     for joint in range(gap.shape[1]):
         g, v, w = gap[:, joint], speed[:, joint], command_speed[:, joint]
         least = MOVING * np.abs(v).max()
         rests = np.abs(v) <= least
+        g = g - (np.median(g[rests]) if rests.any() else 0.0)
         moves = ~rests & (np.abs(w - v) < 0.5 * np.abs(v))
         if moves.sum() < FEWEST:
+            if not rests.all():
+                lags[joint] = (g * np.sign(v))[~rests].sum() / np.abs(v[~rests]).sum()
             continue
-        ratio = (g[moves] - (np.median(g[rests]) if rests.any() else 0.0)) / v[moves]
+        ratio = g[moves] / v[moves]
         order, weight = np.argsort(ratio), np.abs(v[moves])
         total = np.cumsum(weight[order])
         lags[joint] = ratio[order][np.searchsorted(total, total[-1] / 2)]

@@ -269,7 +269,8 @@ def statuses(
     reasons = {indices[row]: text for row, text in texts.items()}
     if halted is not None and inputs is not None:
         codes[halted] = Status.HOLDING.code
-        reasons |= inputs.reasons(halted.reshape(tuple(batch)))
+        found = inputs.reasons(halted.reshape(tuple(batch))).items()
+        reasons |= {index: text for index, text in found if text or index not in reasons}
     return codes, reasons
 
 

@@ -439,7 +439,9 @@ class Controller:
             self._accept_places()
             self._frames, measured = self._inputs.frames, self._inputs.measured
             halted = self._inputs.untrusted(self._holds.known(self.reference))
-            halted = halted.reshape(-1) if tick.paused is None else halted.reshape(-1) | tick.paused
+            halted = (
+                halted.reshape(-1) if tick.paused is None else halted.reshape(-1) | tick.paused
+            )
             tick.halted = halted if halted.any() else None
         if measured is not None and self._gripping is not None:
             # the objects that they hold keep gripping joints from their references
@@ -657,7 +659,10 @@ class Controller:
         """The next references, within the bounds."""
         self._found, goal, progress = found, wanted, self._progress
         if (progress.mode != RUNNING).any() and tick.joints is not None:
-            busy, beyond = self._holds.busy(wanted), 0.0 if self._gaps is None else self._gaps.gap
+            busy, beyond = (
+                self._holds.busy(wanted),
+                0.0 if self._gaps is None else self._gaps.gap,
+            )
             self._progress, led = progress.led(_rows(as_array(wanted - beyond)), busy)
             alone = self._tensor(progress.mode == RUNNING).unsqueeze(-1)
             alone = alone | tick.joints.isnan()

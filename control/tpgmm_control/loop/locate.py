@@ -205,9 +205,7 @@ class Progress:
         servo = self.servo
         if seen.floor is not None:
             servo = replace_fields(servo, floor=seen.floor)
-        servo = servo.update(
-            reference, seen.joints, dt, seen.jumped[:, None], running[:, None]
-        )
+        servo = servo.update(reference, seen.joints, dt, seen.jumped[:, None], running[:, None])
         new = replace_fields(self, servo=servo, relocalized=np.zeros_like(self.placed))
         new = new._timed(seen)
         if self.clock.kind == "even" or not (
@@ -349,7 +347,9 @@ class Progress:
         """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
         off = self.servo.excess > OFF
         probed = (self.mode == PROBING)[:, None] & self.stuck
-        off |= probed & (np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, self.servo.floor / 2))
+        off |= probed & (
+            np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, self.servo.floor / 2)
+        )
         return np.isfinite(seen.joints) & off
 
     # From mode to mode
@@ -429,7 +429,7 @@ class Progress:
         target = np.where(known, servo.corrected, reference)
         new = replace_fields(
             new._switched(held, HELD, target),
-            reading=np.where(held[:, None], servo.near_reading, new.reading),
+            reading=np.where(held[:, None], servo.resting, new.reading),
         )
         new = new._placed(held & self.displaced, known, find)
         return new._switched(held & new.placed, RUNNING, target)
@@ -437,7 +437,8 @@ class Progress:
     def _released(self, seen: Seen) -> Self:
         """Robots that were held, and move again: what they missed is done then."""
         stuck = np.isfinite(seen.joints) & self.stuck
-        way = np.where(stuck, np.abs(self.servo.near_reading - self.reading), 0.0)
+        now = np.array((self.servo.near_reading, self.servo.reading))
+        way = np.where(stuck, np.abs(now - self.reading).min(0), 0.0)
         moved = (way > self._motion_of_held).any(-1)
         # as far as it is led it may stick: from where nothing more is wanted, time goes on
         there = (~stuck | (np.abs(self.wanted - self.target) < self._lead)).all(-1)

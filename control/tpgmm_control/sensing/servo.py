@@ -124,6 +124,12 @@ class Servo:
         return self.reading - self.offset
 
     @property
+    def resting(self) -> Array:
+        """Readings of joints that stand, averaged; of those that move, as they are."""
+        stands = np.abs(self.reading - self.near_reading) <= 3 * np.sqrt(self.noise)
+        return np.where(stands, self.near_reading, self.reading)
+
+    @property
     def weight(self) -> Array:
         """Posterior of the lags (K, B, n_joints); the robot's other joints are a prior."""
         alone = np.exp(self.score)
