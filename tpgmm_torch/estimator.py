@@ -424,7 +424,8 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         mixture = weights, means, covariances
         learned = from_parameters(
             *mixture, time, model.get_params(deep=False),
-            holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary, gaps=gaps,
+            holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary,
+            gaps=gaps,
         )  # fmt: skip
         return model._set(learned)
 
