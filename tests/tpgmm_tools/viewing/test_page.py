@@ -14,7 +14,7 @@ from tests.support.browser import draws, yellow
 from tests.support.recordings import Recording
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
-from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
+from tpgmm_tools.viewing import LiveView, write_motion
 from tpgmm_torch import Frame, Situation
 from tpgmm_torch.exceptions import DependencyError
 
@@ -64,16 +64,10 @@ def test_links_and_objects_are_where_the_reproduction_has_them(motion):
     assert len(recording.props("/covariance/r_hand")["batched_positions"]) > 20
 
 
-@pytest.mark.parametrize(
-    ("write", "package", "extra"),
-    [(write_motion, "viser", "cli"), (write_rerun, "rerun", "rerun")],
-)
-def test_without_a_package_the_error_names_the_extra(
-    monkeypatch, tmp_path, write, package, extra
-):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(DependencyError, match=rf"tpgmm-torch\[{extra}\]"):
-        write(tmp_path / "motion", skills.hands(), skills.new_handling()[0])
+def test_without_viser_the_error_names_the_extra(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[cli\]"):
+        write_motion(tmp_path / "motion", skills.hands(), skills.new_handling()[0])
 
 
 def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
