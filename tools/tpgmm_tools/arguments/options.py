@@ -11,11 +11,11 @@ from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import Parameter, getdoc, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
-from tpgmm_tools.arguments.help import HELP_ALL, Command, Help
+from tpgmm_tools.arguments.help import HELP_ALL, Command
 
 if TYPE_CHECKING:
     from tpgmm_control.obstacles import Scene
@@ -26,14 +26,8 @@ if TYPE_CHECKING:
     from tpgmm_torch.skills.skill import Skill
 
 
-#: Options that most people need: a command's ``--help`` lists those of them that it has.
-BASIC = (
-    "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components",
-    "alignment", "format_", "dataset", "situations", "situation", "object_", "live", "joint",
-    "cell", "rate", "n_situations", "n_demonstrations", "random_state", "name", "board",
-    "tag", "cube", "size", "hand", "check", "env", "policies", "demonstrations", "seeds",
-    "budget", "conditions",
-)  # fmt: skip
+#: What stands for values in the help, for texts TEXT.
+VALUES = {int: "INTEGER", float: "NUMBER"}
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
@@ -252,11 +246,10 @@ def command(
 
         text = (getdoc(function) or "").partition("Parameters\n---")[0]
         run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
-        about = Help(run.__doc__, example, parameters, BASIC)
         parameters = [*parameters, HELP_ALL]
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
-        app.command(cls=type("Command", (Command,), {"about": about}))(run)
+        app.command(cls=Command, epilog=example)(run)
         return function
 
     return add
@@ -283,15 +276,23 @@ def _entries(documented: Any) -> dict[str, tuple[str, str]]:
 
 def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> Parameter:
     """Add what typer must know to a parameter: ``X`` in its type is shown as its value."""
-    text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text).replace("[", "\\[")
+    text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text)
+    name, kinds = (
+        one.name.rstrip("_").replace("_", "-"),
+        (one.annotation, *get_args(one.annotation)),
+    )
     settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
     if shown := re.search("``(.+)``", kind):
         settings["metavar"] = shown[1]
+    elif one.kind is not Parameter.KEYWORD_ONLY:
+        settings["metavar"] = name.upper()
+    elif get_origin(one.annotation) is not Literal:
+        kinds = one.annotation, *get_args(one.annotation)
+        settings["metavar"] = next((VALUES[kind] for kind in kinds if kind in VALUES), "TEXT")
     if least := re.search(r">= (\S+)", kind):
         settings["min"] = type(one.default or 0.5)(float(least[1]))
     if one.annotation is Any:
         settings["parser"] = value
-    name = one.name.rstrip("_").replace("_", "-")
     negation = f"/--no-{name}" if one.default is True else ""
     if one.kind is Parameter.KEYWORD_ONLY:
         info = typer.Option(f"--{name}{negation}", **settings)

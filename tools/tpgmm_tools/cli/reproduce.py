@@ -29,7 +29,7 @@ EXAMPLE = (
     'A file of situations: [{"joints": {"elbow": 0.3, ...}, "frames": {"bottle": '
     '{"position": [0.3, 0, 0.1], "orientation": [1, 0, 0, 0]}}}, ...]; joints may also be a '
     "list in the model's order."
-).replace("[", "\\[")
+)
 
 
 @options.command(app, EXAMPLE)
