@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Iterable
 from inspect import Parameter
 from typing import Annotated, Any
 
@@ -28,28 +29,35 @@ class Command(TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the short help, or all of it after ``--help-all``."""
         every = EVERY in ctx.meta
-        params: list[Any] = self.params
-        records = [(one, _record(one, ctx)) for one in params if not one.hidden]
-        needed = " ".join(syntax for one, (syntax, _) in records if one.required)
-        formatter.write_usage(ctx.command_path, f"{needed} [OPTIONS]".strip())
+        known = [one for one in self.params if one.name != HELP_ALL.name]
+        panels = _panels(known if every else filter(_is_basic, known), ctx, every)
+        needed = [_record(one, ctx)[0] for one in known if one.required]
+        formatter.write_usage(ctx.command_path, " ".join([*needed, "[OPTIONS]"]))
         for paragraph in _paragraphs(self.help, every):
             formatter.write_paragraph()
             formatter.write_text(paragraph)
-        panels: dict[str | None, list[tuple[str, str]]] = {}
-        for one, (syntax, text) in records:
-            if every:
-                panels.setdefault(one.rich_help_panel, []).append((syntax, text))
-            elif one.required or one.name in BASIC:
-                panels.setdefault(None, []).append((syntax, _shorten(text)))
         for panel, rows in panels.items():
-            with formatter.section(panel or "Options"):
+            with formatter.section(panel):
                 formatter.write_dl(rows, col_max=COLUMN)
         formatter.write_paragraph()
-        rest = len(records) - sum(map(len, panels.values()))
-        if rest:
+        if rest := len(known) - sum(map(len, panels.values())):
             formatter.write(f"{rest} more options: {ctx.command_path} --help-all\n")
         for paragraph in _paragraphs(f"Example: {self.epilog}", every):
             formatter.write(_wrap_example(paragraph, formatter.width))
+
+
+def _is_basic(one: Any) -> bool:
+    return one.required or one.name in BASIC
+
+
+def _panels(params: Iterable[Any], ctx: Any, every: bool) -> dict[str, list[tuple[str, str]]]:
+    """Group parameters as they are listed: in panels with all of their texts, or in one."""
+    panels: dict[str, list[tuple[str, str]]] = {}
+    for one in params:
+        syntax, text = _record(one, ctx)
+        panel = (one.rich_help_panel if every else None) or "Options"
+        panels.setdefault(panel, []).append((syntax, text if every else _shorten(text)))
+    return panels
 
 
 def _record(one: Any, ctx: Any) -> tuple[str, str]:

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.skills.skill import Skill
 
 
-#: What stands for values in the help, for texts TEXT.
-VALUES = {int: "INTEGER", float: "NUMBER"}
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
@@ -284,11 +282,10 @@ def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> P
     settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
     if shown := re.search("``(.+)``", kind):
         settings["metavar"] = shown[1]
-    elif one.kind is not Parameter.KEYWORD_ONLY:
+    elif one.kind is Parameter.KEYWORD_ONLY:
+        settings["metavar"] = _value_name(one.annotation)
+    else:
         settings["metavar"] = name.upper()
-    elif get_origin(one.annotation) is not Literal:
-        kinds = one.annotation, *get_args(one.annotation)
-        settings["metavar"] = next((VALUES[kind] for kind in kinds if kind in VALUES), "TEXT")
     if least := re.search(r">= (\S+)", kind):
         settings["min"] = type(one.default or 0.5)(float(least[1]))
     if one.annotation is Any:
@@ -300,6 +297,14 @@ def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> P
         info = typer.Argument(**settings)
     annotation: Any = Annotated[one.annotation, info]
     return one.replace(kind=Parameter.KEYWORD_ONLY, annotation=annotation)
+
+
+def _value_name(kind: Any) -> str | None:
+    """Return what stands for a value in the help; None where typer lists the values."""
+    kinds = {int: "INTEGER", float: "NUMBER"}
+    if get_origin(kind) is Literal:
+        return None
+    return next((kinds[one] for one in (kind, *get_args(kind)) if one in kinds), "TEXT")
 
 
 def value(text: Any) -> Any:
