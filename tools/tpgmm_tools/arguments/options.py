@@ -275,10 +275,7 @@ def _entries(documented: Any) -> dict[str, tuple[str, str]]:
 def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> Parameter:
     """Add what typer must know to a parameter: ``X`` in its type is shown as its value."""
     text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text)
-    name, kinds = (
-        one.name.rstrip("_").replace("_", "-"),
-        (one.annotation, *get_args(one.annotation)),
-    )
+    name = one.name.rstrip("_").replace("_", "-")
     settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
     if shown := re.search("``(.+)``", kind):
         settings["metavar"] = shown[1]
