@@ -109,7 +109,10 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     if model.holds_:
         skill = as_array(trajectory.time)
         held = [
-            (f"{one.frame} by {one.link}", 1.0 * ((one.begin <= skill) & (skill <= one.end)))
+            (
+                f"{one.frame} by {one.link}",
+                ((one.begin <= skill) & (skill <= one.end)).astype(float),
+            )
             for one in model.holds_
         ]
         panels.append(Panel("held", time, held, 1.0))
