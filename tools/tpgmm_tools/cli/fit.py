@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,8 +31,6 @@ EXAMPLE = (
     "tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand --frame bottle "
     "--n-components 30 --out out/model"
 )
-#: Fields of :class:`ModelOptions` that are no parameters of the model.
-CHOSEN = ("parts", "modes", "epsilon")
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,8 @@ class ModelOptions:
         from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
         printed = self.fusion == "covariance"
-        settings = {name: given for name, given in asdict(self).items() if name not in CHOSEN}
+        known = signature(TaskParameterizedGMM).parameters
+        settings = {name: given for name, given in asdict(self).items() if name in known}
         settings["fusion"] = CovarianceFusion(self.epsilon) if printed else InformationFusion()
         if self.n_components == "auto":
             settings["n_components"] = 10

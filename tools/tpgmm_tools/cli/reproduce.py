@@ -129,7 +129,7 @@ def _choose_ways(skill: Any, situations: list[Situation]) -> Iterator[object]:
 
 def _report_contacts(scene: Scene, *motions: Any) -> None:
     """Print what touches obstacles; end with an exit code of its own if anything does."""
-    from tpgmm_tools.contacts import contacts
+    from tpgmm_tools.report import contacts
 
     found = list(contacts(scene, *motions))
     for number, contact in found:
