@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
+from tpgmm_torch import operators as kinds
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
-from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_operators import SelectOperators
 from tpgmm_torch.training.local_data import local_data
@@ -136,7 +138,38 @@ def _label(operator: Operator) -> str:
             for names in (operator.links(), operator.references())
         )
         return f"{links} from {frames}" if frames else links
-    return "joints" if operator == Canonical() else format_operator(operator)
+    return "joints" if operator == kinds.Canonical() else format_operator(operator)
+
+
+def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
+    """Return a label for each local coordinate of an operator.
+
+    Parameters
+    ----------
+    operator, kinematics : Operator, Kinematics
+        Whose coordinates, for which robot.
+    """
+    match operator:
+        case kinds.Stack():
+            return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
+        case kinds.Canonical():
+            names = kinematics.joint_names
+            return [names[column] for column in operator.columns(names)]
+        case kinds.AbsolutePosition() | kinds.RelativePosition():
+            return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    return _other_names(operator, kinematics)
+
+
+def _other_names(operator: Any, kinematics: Kinematics) -> list[str]:
+    """Label forces, parts of rotation vectors and quaternions, and number all else."""
+    if isinstance(operator, kinds.Wrench):
+        forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+        return [*forces, f"{operator.link}\ncontact"]
+    if operator.rotation_vector_starts(kinematics) == (0,):
+        return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
+    if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):
+        return [f"{operator.link}\nq{part}" for part in "wxyz"]
+    return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]
 
 
 def legend(drawing: Figure) -> None:

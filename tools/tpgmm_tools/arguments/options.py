@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
@@ -199,13 +198,6 @@ def refuse(message: str) -> Exception:
     from tpgmm_torch.exceptions import DataError
 
     return DataError(message)
-
-
-def filter_plausibility(action: str) -> None:
-    """Show, make an error of, or ignore what is unlikely about recordings."""
-    from tpgmm_torch.exceptions import PlausibilityWarning
-
-    warnings.filterwarnings("always" if action == "warn" else action, "", PlausibilityWarning)  # type: ignore[arg-type]
 
 
 def command(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -178,6 +179,7 @@ def fit(
     """
     from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.signals import Signals
+    from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_torch.mixture.processes import joined_processes
     from tpgmm_torch.persistence import save
     from tpgmm_torch.structure import choices as structure
@@ -185,7 +187,8 @@ def fit(
     write = model_format(format_)
     choices = settings.choices(operator == ["auto"])
     choices.check(batch_episodes)
-    options.filter_plausibility(plausibility)
+    action: Any = "always" if plausibility == "warn" else plausibility
+    warnings.filterwarnings(action, "", PlausibilityWarning)
     robot, holds = described.read(), _parse_holds(hold)
     operators = _parse_operators(operator)
     model = settings.model(operators, robot)
@@ -316,8 +319,7 @@ def _sum_up_holds(shown: Demonstration, default: bool) -> str:
 
 def _place(frame: Any) -> str:
     """Return where a frame's poses come from."""
-    at = getattr(frame, "at", None) or getattr(frame, "feature", None)
-    return at or "given"
+    return getattr(frame, "at", None) or getattr(frame, "feature", None) or "given"
 
 
 def _sum_up_units(joints: Any, names: Sequence[str]) -> str:

@@ -109,7 +109,9 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     if model.holds_:
         skill = as_array(trajectory.time)
         names = [f"{one.frame} by {one.link}" for one in model.holds_]
-        held = [1.0 * ((one.begin <= skill) & (skill <= one.end)) for one in model.holds_]
+        held = [
+            ((one.begin <= skill) & (skill <= one.end)).astype(float) for one in model.holds_
+        ]
         panels.append(Panel("held", time, [*zip(names, held, strict=True)], 1.0))
     return panels
 
