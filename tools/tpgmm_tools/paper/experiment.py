@@ -42,6 +42,10 @@ __all__ = ["BottleExperiment"]
 EPSILONS = (1e-6, 1e-4, 1e-2)
 
 
+def _say_nothing(text: str) -> None:
+    """Report to nobody."""
+
+
 @dataclass
 class BottleExperiment:
     """One run of the experiment.
@@ -72,7 +76,7 @@ class BottleExperiment:
     n_demonstrations: int = 10
     n_situations: int = 50
     seed: int = 0
-    report: Callable[[str], None] = lambda text: None
+    report: Callable[[str], None] = _say_nothing
     skill: BottleShaking = field(default_factory=BottleShaking)
 
     def run(self) -> dict[str, Any]:
