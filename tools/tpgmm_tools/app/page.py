@@ -301,7 +301,8 @@ def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
                 taken = gr.File(label="to take away", file_count="multiple")
 
         def ready(*given: Any) -> tuple[Skill | None, str, Any, list[list[Any]]]:
-            new, text = learn(*given, more=more)
+            answer: Callable[..., tuple[Skill | None, str]] = learn
+            new, text = answer(*given, more)
             numbers = list(range(1, len(new.demonstrations) + 1 if new is not None else 2))
             return new, text, gr.Dropdown(numbers, value=1), places_of(new, 1)
 
