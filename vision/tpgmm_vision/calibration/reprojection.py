@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, pose_matrix, rigid
+from tpgmm_vision.poses import Array, cross_matrix, pose_matrix, rigid
 
 Integers = NDArray[np.int_]
 
@@ -183,21 +183,23 @@ class Reprojection:
         back = camera[:, :3, :3].swapaxes(-1, -2)
         local = (back @ (world - camera[:, :3, 3])[..., None])[..., 0]
         moves = np.zeros((len(world), 3, self.n_steps))
+        ones = np.tile(np.eye(3), (len(world), 1, 1))
         for sign, part in ((-1.0, of[0]), (1.0, of[1])):
             link = self.links[part]
             arm = world - links[c.posture, link, :3, 3]
             linear, angular = np.split(jacobians[c.posture, link], 2, axis=1)
-            moves[..., self.offsets] += sign * (linear - _cross(arm) @ angular)
+            moves[..., self.offsets] += sign * (linear - cross_matrix(arm) @ angular)
             base = self.base_of[link]
             there = np.flatnonzero(base >= 0)
             columns = 6 * (len(self.carriers) + base[there, None]) + np.arange(6)
-            twist = np.concatenate((np.tile(np.eye(3), (len(world), 1, 1)), -_cross(world)), -1)
+            twist = np.concatenate((ones, -cross_matrix(world)), -1)
             moves[there[:, None], :, columns] += sign * twist[there].swapaxes(1, 2)
-        twist = np.concatenate((target[:, :3, :3], -target[:, :3, :3] @ _cross(points)), -1)
+        turn = target[:, :3, :3]
+        twist = np.concatenate((turn, -turn @ cross_matrix(points)), -1)
         moves[rows[:, None], :, 6 * of[1][:, None] + np.arange(6)] = twist.swapaxes(1, 2)
-        moves[..., -1] = (target[:, :3, :3] @ points[..., None])[..., 0]
+        moves[..., -1] = (turn @ points[..., None])[..., 0]
         seen = back @ moves
-        twist = np.concatenate((np.tile(-np.eye(3), (len(world), 1, 1)), _cross(local)), -1)
+        twist = np.concatenate((-ones, cross_matrix(local)), -1)
         seen[rows[:, None], :, 6 * of[0][:, None] + np.arange(6)] = twist.swapaxes(1, 2)
         pixels, jacobian = np.zeros((len(world), 2)), np.zeros((len(world), 2, self.n_steps))
         for number, one in enumerate(self.cameras):
@@ -209,10 +211,3 @@ class Reprojection:
             pixels[own], jacobian[own] = away + one.principal_point, scale * rates @ seen[own]
             jacobian[own, :, self.scales.start + number] = away
         return pixels, jacobian, seen
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices of cross products ``v x .`` (..., 3, 3)."""
-    made = np.zeros((*vectors.shape, 3))
-    made[..., [2, 0, 1], [1, 2, 0]], made[..., [1, 2, 0], [2, 0, 1]] = vectors, -vectors
-    return made

@@ -25,8 +25,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_vision.cell import Cell, read_cell
-from tpgmm_vision.detection.tag_source import camera_poses
+from tpgmm_vision.cell import Cell, camera_poses, read_cell
 from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import EpisodePictures
