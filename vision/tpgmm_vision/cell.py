@@ -356,8 +356,7 @@ def _entries(
 ) -> dict[str, Any]:
     """Read the entries of an object."""
     readers = {**needed, **other}
-    if not isinstance(value, Mapping):
-        raise DataError(f"{where} is an object with {list(readers)}, got {value!r}")
+    _plain(Mapping, f"an object with {list(readers)}")(value, where)
     if extra := [name for name in value if name not in readers]:
         raise DataError(f"{where} has no entries {extra}; there are {list(readers)}")
     for name in needed:
@@ -374,9 +373,8 @@ def _mapping(reader: _Reader) -> _Reader:
     """Make a reader of an object of named entries."""
 
     def read(value: Any, where: str) -> dict[str, Any]:
-        if not isinstance(value, Mapping):
-            raise DataError(f"{where} is an object of named entries, got {value!r}")
-        return {name: reader(one, f"{where}: {name}") for name, one in value.items()}
+        entries = _plain(Mapping, "an object of named entries")(value, where)
+        return {name: reader(one, f"{where}: {name}") for name, one in entries.items()}
 
     return read
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -111,9 +110,8 @@ def estimate_pose(
     PoseEstimate or None
         None if no tag of the target is seen.
     """
-    problem = _Problem.of(views, target)
     known = (upright, height) if upright or height is not None else None
-    while problem.seen:
+    while (problem := _Problem(views, target)).seen:
         fit = problem.best(known)
         if known and fit.cost > problem.freedom + MOST_MISFIT**2:
             free = problem.best(None)
@@ -121,7 +119,9 @@ def estimate_pose(
         wrong = problem.contradicts(fit)
         if not wrong or len(problem.tags) == 1:
             return problem.judge_fit(fit, wrong)
-        problem = problem.without(problem.worst(fit.pose))
+        worst = problem.worst(fit.pose)
+        left = {number: one for number, one in target.corners.items() if number != worst}
+        target = replace(target, corners=left)
     return None
 
 
@@ -135,47 +135,25 @@ class _Fit:
     second: _Fit | None = None
 
 
-@dataclass(frozen=True)
 class _Seen:
     """The corners of a target's tags in one view.
 
     ``points`` (n, 4, 3) in the target's frame, ``pixels`` (n, 4, 2), and matrices (n, 8, 8)
-    that whiten them.
+    that ``whiten`` them.
     """
 
-    view: View
-    numbers: tuple[int, ...]
-    points: Array
-    pixels: Array
-    whiten: Array
-
-    @classmethod
-    def of(cls, view: View, target: Target, numbers: Sequence[int]) -> _Seen:
-        """Some tags of the target."""
+    def __init__(self, view: View, target: Target, numbers: Sequence[int]) -> None:
         usual = CORNER_STD**2 * np.eye(8)
         given = [(view.covariances or {}).get(number, usual) for number in numbers]
-        return cls(
-            view,
-            tuple(numbers),
-            np.array([target.corners[number] for number in numbers]),
-            np.array([view.corners[number] for number in numbers]),
-            np.linalg.inv(np.linalg.cholesky(np.array(given))),
-        )
-
-    def without(self, number: int) -> _Seen:
-        """Return the same without a tag."""
-        kept = [one != number for one in self.numbers]
-        left = tuple(one for one in self.numbers if one != number)
-        return _Seen(self.view, left, self.points[kept], self.pixels[kept], self.whiten[kept])
+        self.view, self.numbers, self._from_base = view, numbers, inverse(view.base_from_camera)
+        self.points = np.array([target.corners[number] for number in numbers])
+        self.pixels = np.array([view.corners[number] for number in numbers])
+        self.whiten = np.linalg.inv(np.linalg.cholesky(np.array(given)))
 
     def errors(self, pose: Array) -> Array:
         """Expected less seen corners (n, 4, 2) [pixels]."""
         points = transform(self._from_base @ pose, self.points.reshape(-1, 3))
         return self.view.camera.project(points).reshape(-1, 4, 2) - self.pixels
-
-    @cached_property
-    def _from_base(self) -> Array:
-        return inverse(self.view.base_from_camera)
 
     def residual(self, pose: Array) -> tuple[Array, Array]:
         """Compute errors (n, 8) in standard deviations, and their Jacobian (n, 8, 6)."""
@@ -193,32 +171,18 @@ class _Seen:
         return np.einsum("nij,nj->ni", self.whiten, error), self.whiten @ moved
 
 
-@dataclass(frozen=True)
 class _Problem:
-    """All corners of a target."""
+    """All corners of a target, and the numbers of their tags."""
 
-    seen: tuple[_Seen, ...]
-
-    @classmethod
-    def of(cls, views: Sequence[View], target: Target) -> _Problem:
-        """Those of the target's tags."""
+    def __init__(self, views: Sequence[View], target: Target) -> None:
         found = [(view, sorted(view.corners.keys() & target.corners.keys())) for view in views]
-        return cls(tuple(_Seen.of(view, target, tags) for view, tags in found if tags))
-
-    @property
-    def tags(self) -> tuple[int, ...]:
-        """Numbers of the tags."""
-        return tuple(dict.fromkeys(number for one in self.seen for number in one.numbers))
+        self.seen = [_Seen(view, target, tags) for view, tags in found if tags]
+        self.tags = tuple(dict.fromkeys(number for one in self.seen for number in one.numbers))
 
     @property
     def freedom(self) -> int:
         """Number of measurements beyond those of a pose."""
         return 8 * sum(len(one.numbers) for one in self.seen) - 6
-
-    def without(self, number: int) -> _Problem:
-        """Return the same without a tag."""
-        left = (one.without(number) for one in self.seen)
-        return _Problem(tuple(one for one in left if one.numbers))
 
     def worst(self, pose: Array) -> int:
         """Find the tag that fits a pose worst."""

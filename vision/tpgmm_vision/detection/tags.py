@@ -114,11 +114,8 @@ class TagDetector:
         rough, twice = self._search(image, boxes)
         found = {n: self._refine(image, n, c) for n, c in rough.items() if n not in twice}
         good = {n: fit for n, fit in found.items() if fit is not None}
-        return Detections(
-            {n: corners for n, (corners, _) in good.items()},
-            {n: covariance for n, (_, covariance) in good.items()},
-            frozenset(twice),
-        )
+        corners, covariances = ({n: fit[k] for n, fit in good.items()} for k in (0, 1))
+        return Detections(corners, covariances, frozenset(twice))
 
     def _search(
         self, image: Picture, boxes: Sequence[Box] | None
