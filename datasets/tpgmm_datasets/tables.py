@@ -58,6 +58,8 @@ FORMULA = re.compile(r"'*[=+@\t\r-]")
 #: Rows times columns beyond which a table is not read.
 MOST_NUMBERS = 2e7
 
+Motion = Demonstration | Trajectory
+
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
     """Write demonstrations as a table, one row per time step.
@@ -132,11 +134,9 @@ def trajectories_to_frame(
     parts = []
     for episode, (one, poses) in enumerate(zip(trajectories, situations, strict=True)):
         rows, columns = np.triu_indices(len(one.joint_names))
-        upper = as_array(one.covariance)[:, rows, columns]
-        names = _covariance_names(one.joint_names)
-        parts.append(
-            _motion_columns(episode, one, poses) | dict(zip(names, upper.T, strict=True))
-        )
+        values = as_array(one.covariance)[:, rows, columns].T
+        upper = dict(zip(_covariance_names(one.joint_names), values, strict=True))
+        parts.append(_motion_columns(episode, one, poses) | upper)
     return _join_parts(parts, trajectories[0])
 
 
@@ -193,12 +193,10 @@ def demonstrations_from_frame(
     for label, part in parts:
         kept = part.dropna(axis="columns", how="all")
         try:
-            at, values = map(
-                torch.from_numpy, (numbers(kept, [time])[:, 0], numbers(kept, names))
-            )
+            at, values = (torch.from_numpy(numbers(kept, each)) for each in ([time], names))
             poses, events = _read_poses(kept, {time, episode, *names}), _read_events(kept)
             forces = {n: torch.from_numpy(w) for n, w in _read_wrenches(kept).items()}
-            made.append(Demonstration(at, values, poses, called, events, wrenches=forces))
+            made.append(Demonstration(at[:, 0], values, poses, called, events, wrenches=forces))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
     return made
@@ -318,7 +316,7 @@ def _check_suffix(path: Path) -> Path:
 
 
 def _motion_columns(
-    episode: int, motion: Demonstration | Trajectory, frames: Mapping[str, Frame]
+    episode: int, motion: Motion, frames: Mapping[str, Frame]
 ) -> dict[str, Array]:
     """Return the columns of episode, time, joints and frames."""
     rows, names = len(motion), _name_joints(motion)
@@ -334,9 +332,7 @@ def _motion_columns(
     return dict(columns)
 
 
-def _join_parts(
-    parts: Sequence[Mapping[str, Array]], motion: Demonstration | Trajectory
-) -> pd.DataFrame:
+def _join_parts(parts: Sequence[Mapping[str, Array]], motion: Motion) -> pd.DataFrame:
     pandas = _import_pandas()
     table = pandas.concat([pandas.DataFrame(part) for part in parts], ignore_index=True)
     # parquet keeps it: joints may have names like those of poses
@@ -344,7 +340,7 @@ def _join_parts(
     return table
 
 
-def _name_joints(motion: Demonstration | Trajectory) -> list[str]:
+def _name_joints(motion: Motion) -> list[str]:
     return list(motion.joint_names or map(str, range(motion.joints.shape[-1])))
 
 

@@ -347,9 +347,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 def _tasks(task: str | Sequence[str], count: int) -> list[str]:
     tasks = [task] * count if isinstance(task, str) else list(task)
     if len(tasks) != count or not all(isinstance(item, str) and item for item in tasks):
-        raise DatasetError(
-            f"task is one text or one per demonstration, not empty; got {task!r}"
-        )
+        raise DatasetError(f"task is a text or one per demonstration, not empty; got {task!r}")
     return tasks
 
 

@@ -32,6 +32,7 @@ from tpgmm_torch.training.hold_detection import holding_as_in
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]
+Sources = Mapping[str, Pose]
 EventSource = str | Detector | Callable[[Demonstration], float]
 
 
@@ -70,7 +71,7 @@ def _frame_source(
 
 def event_sources(
     events: Mapping[str, EventSource] | None,
-    frames: Mapping[str, Pose],
+    frames: Sources,
     stored: Collection[str],
     names: Sequence[str] | None,
 ) -> dict[str, Detector | Callable[[Demonstration], float]]:
@@ -121,9 +122,7 @@ def _find_usual_event(frame: str, pose: LinkPose, names: Sequence[str]) -> Detec
         raise DatasetError(message) from error
 
 
-def stored_frames(
-    layout: Layout, sources: Mapping[str, Pose], rows: EpisodeRows
-) -> dict[str, Frame]:
+def stored_frames(layout: Layout, sources: Sources, rows: EpisodeRows) -> dict[str, Frame]:
     """Read the frames of an episode that are not at links."""
     frames, where = dict[str, Frame](), rows.episode.where
     for name, source in sources.items():

@@ -292,9 +292,7 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield place, _object(text, place)
 
 
-def _episode(
-    info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
-) -> Episode:
+def _episode(info: Mapping[str, Any], place: str, row: dict[str, Any], modern: bool) -> Episode:
     _check_numbers(row, ROW_NUMBERS if modern else ROW_NUMBERS[:2], place)
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
@@ -408,7 +406,5 @@ def _contradictions(
     listed = {episode.file for episode in episodes}
     for path in chunked_files(root / "data"):
         if path.relative_to(root) not in listed:
-            message = (
-                "no episode lies in this file: a left-over of another or a broken recording"
-            )
+            message = "no episode lies in this file: left over of another or a broken recording"
             yield DatasetError(message, check="metadata", file=path.relative_to(root))
