@@ -50,6 +50,8 @@ __all__ = ["Cell", "read_cell", "write_cell"]
 
 #: Poses that are nearer to each other are the same: [mm], [deg].
 SAME_PLACE, SAME_ANGLE = 0.1, 0.02
+#: How many numbers each part of a lens has.
+LENS = {"focal_length": 2, "principal_point": 2, "distortion": 5}
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,11 +364,8 @@ def _entries(
     for name in needed:
         if value.get(name) is None:
             raise DataError(f"{where} needs {name!r}; it has {list(value)}")
-    return {
-        name: read(value[name], f"{where}: {name}")
-        for name, read in readers.items()
-        if value.get(name) is not None
-    }
+    there = [name for name in readers if value.get(name) is not None]
+    return {name: readers[name](value[name], f"{where}: {name}") for name in there}
 
 
 def _mapping(reader: _Reader) -> _Reader:
@@ -430,10 +429,10 @@ def _target(value: Any, where: str) -> Target:
 
 
 def _camera(value: Any, where: str) -> CellCamera:
-    numbers = {"size": 2, "focal_length": 2, "principal_point": 2}
-    needed = {"key": _text, **{name: _numbers(n) for name, n in numbers.items()}}
-    other = {"distortion": _numbers(5), "pose": _pose, "link": _text, "report": _text}
-    lens = _entries(value, where, needed, other)
+    numbers = {name: _numbers(n) for name, n in LENS.items()}
+    other = {"distortion": numbers.pop("distortion"), "pose": _pose}
+    other |= {"link": _text, "report": _text}
+    lens = _entries(value, where, {"key": _text, "size": _numbers(2), **numbers}, other)
     size, mount = lens.pop("size"), {n: lens.pop(n, None) for n in ("key", "pose", "link")}
     lens.pop("report", None)
     return CellCamera(_make_at(Camera, where, *map(int, size), **lens), **mount)
@@ -450,13 +449,8 @@ def _check(value: Any, where: str) -> CellCheck:
 
 def camera_content(camera: Camera, key: str) -> dict[str, Any]:
     """Entry in a cell file of a camera without a pose."""
-    return {
-        "key": key,
-        "size": [camera.width, camera.height],
-        "focal_length": list(camera.focal_length),
-        "principal_point": list(camera.principal_point),
-        "distortion": list(camera.distortion),
-    }
+    lens = {name: list(getattr(camera, name)) for name in LENS}
+    return {"key": key, "size": [camera.width, camera.height], **lens}
 
 
 def pose_content(pose: Array) -> list[float]:

@@ -154,9 +154,8 @@ class _Joints:
                     ends.setdefault((self.names[joint], value), []).append(index)
         if odd := {end: indices for end, indices in ends.items() if len(indices) > 1}:
             places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
-            message = (
-                f"motions stop dead at one value and go on from it: {shorten_list(places)}"
-            )
+            ends_at = shorten_list(places)
+            message = f"motions stop dead at one value and go on from it: {ends_at}"
             remedy = "Was the recording cut off at a limit, or a sensor saturated?"
             about = sorted(set().union(*odd.values()))
             joints = dict.fromkeys(name for name, _ in odd)

@@ -173,9 +173,7 @@ def _match_robot(feature: Feature, names: Labels, robot: Any) -> tuple[str, ...]
     return tuple(matched.get(name, name) for name in names)
 
 
-def _choose_units(
-    feature: Feature, named: Labels, units: Units, robot: Any
-) -> tuple[Unit, ...]:
+def _choose_units(feature: Feature, named: Labels, units: Units, robot: Any) -> list[Unit]:
     """Choose units: given ones, by the data set's name or the robot's, before declared ones."""
     final = named or feature.labels
     stored = feature.names or final

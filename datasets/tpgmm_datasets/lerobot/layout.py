@@ -317,11 +317,7 @@ def _check_numbers(row: Mapping[str, Any], names: Sequence[str], place: str) -> 
 
 
 def episode_file(
-    info: Mapping[str, Any],
-    template: str,
-    index: int,
-    place: tuple[int, int] | None,
-    **texts: str,
+    info: Mapping[str, Any], template: str, index: int, place: Any, **texts: str
 ) -> Path:
     """Find the file of an episode, relative to the root, by a template in ``info.json``.
 

@@ -284,12 +284,11 @@ class _Task:
         """Solve for the poses of a camera in its carrier and of a target in the hand."""
         found = list[tuple[float, Array, Array]]()
         hand, seen = hand_from_carrier[:, :3], camera_from_target[:, :3]
+        solve: Any = cv2.calibrateHandEye
+        lists = [*hand[..., :3]], [*hand[..., 3]], [*seen[..., :3]], [*seen[..., 3]]
         for method in CLOSED_FORMS:
             with suppress(cv2.error):
-                turn, place = cv2.calibrateHandEye(
-                    [*hand[..., :3]], [*hand[..., 3]], [*seen[..., :3]], [*seen[..., 3]],
-                    method=method,
-                )  # fmt: skip
+                turn, place = solve(*lists, method=method)
                 if np.isfinite(place).all() and np.linalg.det(turn) > 0.5:
                     poses = hand_from_carrier @ rigid(turn, place) @ camera_from_target
                     target, _ = mean_pose(poses)

@@ -169,9 +169,8 @@ def _fit_camera(
 ) -> tuple[Camera, dict[str, float], Array, float]:
     """Camera, error of each picture [pixels], rotations, and the share of f that is unsure."""
     points, pixels = ([part[k] for part in views.values()] for k in (0, 1))
-    found: Any = cv2.calibrateCameraExtended(
-        points, pixels, size, None, None, flags=flags, criteria=ENDS
-    )
+    fit: Any = cv2.calibrateCameraExtended
+    found = fit(points, pixels, size, None, None, flags=flags, criteria=ENDS)
     _, matrix, lens, turns, _, spread, _, errors = found
     lengths, centre = np.diag(matrix)[:2], matrix[:2, 2]
     camera = Camera(size[0], size[1], tuple(lengths), tuple(centre), tuple(lens.ravel()[:5]))

@@ -118,20 +118,15 @@ class TagSource:
         """Tags in a picture: near where they were, or everywhere if that is not all."""
         before, boxes = self.detections.get(name, {}), self._boxes.get(name)
         found = {f: detect(picture, boxes) for f, detect in self._detectors.items()}
-        if boxes is None or all(
-            found[family].corners.keys() >= known.corners.keys()
-            for family, known in before.items()
-        ):
+        whole = all(found[f].corners.keys() >= one.corners.keys() for f, one in before.items())
+        if boxes is None or whole:
             return found
         return {f: detect(picture) for f, detect in self._detectors.items()}
 
     def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
         """Views of a target by all cameras that are where they were."""
-        return [
-            self._view(name, target.family, places[name])
-            for name in self._cameras
-            if not self._moved[name]
-        ]
+        still = [name for name in self._cameras if not self._moved[name]]
+        return [self._view(name, target.family, places[name]) for name in still]
 
     def _view(self, name: str, family: str, place: Array) -> View:
         """View of the tags of a family by a camera that is in some place."""
@@ -141,11 +136,8 @@ class TagSource:
     def _object(self, name: str, places: Mapping[str, Array], time: float) -> ObservedPose:
         """Measure one object."""
         target, known = self._targets[name], self._cell.objects[name]
-        twice = sorted(
-            number
-            for seen in self.detections.values()
-            for number in seen[target.family].twice & target.corners.keys()
-        )
+        seen = set().union(*(one[target.family].twice for one in self.detections.values()))
+        twice = sorted(seen & target.corners.keys())
         reason = f"tag {twice[0]} is seen twice" if twice else "no tag of it is seen"
         views = [] if twice else self._views(target, places)
         found = estimate_pose(views, target, upright=known.upright, height=known.height)

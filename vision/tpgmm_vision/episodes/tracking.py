@@ -105,14 +105,12 @@ def track_lerobot(
     return reports
 
 
-def _offsets(
-    layout: Layout, cell: Cell, robot: Kinematics | None, joint_names: Any
-) -> dict[str, list[float]]:
+def _offsets(layout: Layout, cell: Cell, robot: Any, called: Any) -> dict[str, list[float]]:
     """Return the joint offsets of a cell for each value of states and actions."""
     declared, given = dict[str, list[float]](), cell.joint_offsets
     keys = {joint_feature(layout), kept.ACTION} & layout.features.keys()
     for key in keys if any(given.values()) else ():
-        names = names_of(layout.feature(key), joint_names, robot) or ()
+        names = names_of(layout.feature(key), called, robot) or ()
         matched = match_names(list(given), names, key)
         declared[key] = [given.get(matched.get(name, ""), 0.0) for name in names]
     return declared
