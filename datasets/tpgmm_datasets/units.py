@@ -283,7 +283,7 @@ def units_of(
     """
     given = units if isinstance(units, Mapping) else {"*": units}
     called = list(zip(stored, final, strict=True))
-    fitting = {k: [i for i, names in enumerate(called) if fits(k, *names)] for k in given}
+    fitting = {key: _find_places(key, called) for key in given}
     if unknown := [key for key, places in fitting.items() if not places]:
         there = f"which fit no value; they are called {list(dict.fromkeys(stored))}"
         raise DatasetError(f"units names {unknown}, {there}", column=column)
@@ -292,6 +292,10 @@ def units_of(
         for place in fitting[key]:
             chosen[place] = _resolve_lerobot(given[key], *called[place], robot)
     return chosen
+
+
+def _find_places(pattern: str, called: Sequence[tuple[str, str]]) -> list[int]:
+    return [i for i, names in enumerate(called) if fits(pattern, *names)]
 
 
 def _resolve_lerobot(unit: Unit, stored: str, name: str, robot: Any) -> Unit:

@@ -202,7 +202,7 @@ class _Task:
         *places, pixels, points = zip(*rows, strict=True)
         seen_at = map(np.concatenate, (pixels, points))
         corners = Corners(*seen_at, *np.repeat(np.array(places), 4, 1))
-        arms = [{link for link in robot.links if link.startswith(base)} for base in bases]
+        arms = [_find_arm(robot, base) for base in bases]
         self.problem = Reprojection(robot, joints, corners, self.lenses, carriers, arms)
 
     def _collect_rows(self) -> list[tuple[int, int, int, int, Array, Array]]:
@@ -439,6 +439,11 @@ def _check_detections(name: str, found: Sequence[Detections], total: int) -> Non
                         "the others")  # fmt: skip
 
 
+def _find_arm(robot: Kinematics, base: str) -> set[str]:
+    """Find the links whose names begin so."""
+    return {link for link in robot.links if link.startswith(base)}
+
+
 def _check_links(robot: Kinematics, links: Sequence[str | None], bases: Sequence[str]) -> None:
     """Refuse links that the robot lacks, a cell without motion, and arms without a base."""
     if unknown := {*links} - {None, *robot.links}:
@@ -446,5 +451,5 @@ def _check_links(robot: Kinematics, links: Sequence[str | None], bases: Sequence
     if not any(links):
         raise DataError("no camera and no target is on a link of the robot: nothing moves")
     for base in bases:
-        if len({link.startswith(base) for link in robot.links}) < 2:
+        if len(_find_arm(robot, base)) in (0, len(robot.links)):
             raise DataError(f"links of an arm begin with {base!r}, not all; got {robot.links}")

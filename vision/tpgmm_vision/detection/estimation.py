@@ -112,10 +112,7 @@ def estimate_pose(
     """
     known = (upright, height) if upright or height is not None else None
     while (problem := _Problem(views, target)).seen:
-        fit = problem.best(known)
-        if known and fit.cost > problem.freedom + MOST_MISFIT**2:
-            free = problem.best(None)
-            fit = free if fit.cost > free.cost + MOST_MISFIT**2 else fit
+        fit = problem.fit(known)
         wrong = problem.contradicts(fit)
         if not wrong or len(problem.tags) == 1:
             return problem.judge_fit(fit, wrong)
@@ -191,6 +188,14 @@ class _Problem:
             for number, errors in zip(one.numbers, one.residual(pose)[0], strict=True):
                 costs[number] += float(errors @ errors)
         return max(costs, key=lambda number: costs[number])
+
+    def fit(self, known: Known) -> _Fit:
+        """Fit the pose, without what is known where the corners contradict it."""
+        fit = self.best(known)
+        if known and fit.cost > self.freedom + MOST_MISFIT**2:
+            free = self.best(None)
+            fit = free if fit.cost > free.cost + MOST_MISFIT**2 else fit
+        return fit
 
     def best(self, known: Known) -> _Fit:
         """Fit the hypothesis that fits best."""
