@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from tests.support.lerobot_sets import to_v21
 from tests.support.written_sets import FPS, assert_same, demonstration, unit
 from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
-from tpgmm_datasets import writer as writer_module
 from tpgmm_datasets.writer import add_frames
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -142,7 +141,10 @@ def test_append_refuses_what_does_not_fit(tmp_path, other, arguments, message):
     assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
 
 
-@pytest.mark.parametrize("stage", ["episode_statistics", "write_tables", "feature_table"])
+STAGES = ("summed.episode_statistics", "write_tables", "kept.feature_table")
+
+
+@pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("append", [False, True])
 def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, stage, append):
     root = tmp_path / "set"
@@ -150,7 +152,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
     if append:
         save_lerobot(old, root, fps=FPS, task="reach")
 
-    monkeypatch.setattr(writer_module, stage, interrupt)
+    monkeypatch.setattr(f"tpgmm_datasets.writer.{stage}", interrupt)
     with pytest.raises(KeyboardInterrupt):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
     assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])
@@ -229,9 +231,9 @@ def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
             add_frames(root, tmp_path / "copy", frames)
     with pytest.raises(DatasetError, match=r"sets of v3\.0, this is v2\.1 .*dataset convert"):
         add_frames(to_v21(root, tmp_path / "old"), tmp_path / "copy", given)
-    for stage in ("episode_statistics", "write_tables"):
+    for stage in STAGES[:2]:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(writer_module, stage, interrupt)
+            patch.setattr(f"tpgmm_datasets.writer.{stage}", interrupt)
             add_frames(root, tmp_path / "copy", given)
     with pytest.raises(TypeError):  # the last that is written
         add_frames(root, tmp_path / "copy", given, files={"meta/cell.json": None})

@@ -5,8 +5,8 @@ from tests.support.drawn_tags import CAMERA, drawn, look_at
 from tpgmm_datasets.robots import so101_urdf
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_vision.cell import camera_content, cell_from, pose_content
-from tpgmm_vision.detection.tag_source import TagSource, camera_poses
+from tpgmm_vision.cell import camera_content, camera_poses, cell_from, pose_content
+from tpgmm_vision.detection.tag_source import TagSource
 from tpgmm_vision.poses import inverse, pose_matrix, pose_vector, rigid
 from tpgmm_vision.sources import pose_source
 from tpgmm_vision.targets import target_from
