@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.support.fetching import skills
+from tests.support.refusals import refused
 from tests.support.skills import (
     canonical,
     few_bottles,
@@ -150,8 +151,7 @@ class Half(Canonical):
 def test_classes_of_ones_own_are_given(tmp_path):
     model = canonical(operators=[Half()]).fit(waves())
     save(model, tmp_path / "model")
-    with pytest.raises(ModelFileError, match=r"custom=\[Half\]"):
-        load(tmp_path / "model")
+    refused(lambda: load(tmp_path / "model"), ModelFileError, r"custom=\[Half\]")
     assert load(tmp_path / "model", custom=[Half]).operators_ == (Half(),)
 
     @dataclass(frozen=True)
@@ -159,20 +159,16 @@ def test_classes_of_ones_own_are_given(tmp_path):
         dimension = linearize = coordinates = None
 
     named = replace(model.skill, operators=[Canonical.__new__(Canonical)])
-    with pytest.raises(ModelFileError, match="rename it"):
-        save(named, tmp_path / "other")
+    refused(lambda: save(named, tmp_path / "other"), ModelFileError, "rename it")
 
 
 def test_other_folders_are_left_alone_and_refused(tmp_path):
-    with pytest.raises(NotFittedError):
-        save(canonical(), tmp_path / "model")
+    refused(lambda: save(canonical(), tmp_path / "model"), NotFittedError)
     (tmp_path / "else").mkdir()
     (tmp_path / "else" / "notes.txt").write_text("mine")
-    with pytest.raises(ModelFileError, match="choose another"):
-        save(hands(), tmp_path / "else")
+    refused(lambda: save(hands(), tmp_path / "else"), ModelFileError, "choose another")
     assert (tmp_path / "else" / "notes.txt").read_text() == "mine"
-    with pytest.raises(ModelFileError, match="is missing"):
-        load(tmp_path / "nowhere")
+    refused(lambda: load(tmp_path / "nowhere"), ModelFileError, "is missing")
     (tmp_path / "policy").mkdir()
     (tmp_path / "policy" / "config.json").write_text('{"type": "act"}')
     with pytest.raises(ModelFileError, match="describes no model: it is a LeRobot policy"):
@@ -184,8 +180,7 @@ def test_a_model_of_before_says_to_fit_again(tmp_path):
     file = tmp_path / "model" / "config.json"
     config = json.loads(file.read_text())
     file.write_text(json.dumps(config | {"version": 1}))
-    with pytest.raises(ModelFileError, match="fit again"):
-        load(tmp_path / "model")
+    refused(lambda: load(tmp_path / "model"), ModelFileError, "fit again")
 
 
 def test_devices_that_are_not_there_are_named(tmp_path):

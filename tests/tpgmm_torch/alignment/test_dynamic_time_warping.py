@@ -19,6 +19,7 @@ from tests.support.motions import (
     motion,
     random_clock,
 )
+from tests.support.refusals import refused
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import CHEST, BottleShaking
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
@@ -158,8 +159,7 @@ def test_one_demonstration_alone_stays_itself(reference):
     ],
 )
 def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
-    with pytest.raises(error, match=message):
-        DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2])
+    refused(lambda: DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2]), error, message)
 
 
 @pytest.mark.parametrize("reference", [0, "barycenter"])

@@ -22,6 +22,7 @@ from sklearn.mixture import GaussianMixture
 
 from tests.support.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
 from tests.support.em_reference import nearly_singular
+from tests.support.refusals import refused
 from tpgmm_torch.exceptions import (
     ConvergenceWarning,
     DataError,
@@ -376,16 +377,13 @@ def test_parameters_that_are_no_mixture_are_refused(changed, error, message):
         "covariances": [np.stack([np.eye(width)] * 3) for width in WIDTHS],
     }
     BlockGaussianMixture.from_parameters(**given)
-    with pytest.raises(error, match=message):
-        BlockGaussianMixture.from_parameters(**given | changed)
+    refused(lambda: BlockGaussianMixture.from_parameters(**given | changed), error, message)
 
 
 def test_a_wrong_number_of_samples_is_refused(clusters):
     model = fitted(BlockGaussianMixture(2), clusters)
-    with pytest.raises(DataError, match="at least 1"):
-        model.sample(0)
-    with pytest.raises(ValueError, match="4 features"):
-        model.predict(clusters[:, :4])
+    refused(lambda: model.sample(0), DataError, "at least 1")
+    refused(lambda: model.predict(clusters[:, :4]), ValueError, "4 features")
 
 
 # Rows that share one responsibility: ``group_size`` consecutive ones.

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.support.blocks import WIDTHS, fitted
+from tests.support.refusals import refused
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile
@@ -92,8 +93,7 @@ def with_nan(piece):
 def test_a_bad_batch_is_named(timed_rows, spoil, error, message):
     pieces = np.split(timed_rows, [500, 1000, 2000])
     pieces[2] = spoil(pieces[2])
-    with pytest.raises(error, match=message):
-        RowFile.of(iter(pieces))
+    refused(lambda: RowFile.of(iter(pieces)), error, message)
 
 
 def test_no_rows_and_one_row_are_refused():
@@ -153,5 +153,4 @@ def test_rounding_is_ten_times_the_precision_of_the_largest(times, varies):
     [(np.empty((0, 3)), "there are no rows"), (np.array([[1e200], [-1e200]]), "overflows")],
 )
 def test_rows_without_moments_are_refused(rows, message):
-    with pytest.raises(DataError, match=message):
-        ColumnMoments.of(rows)
+    refused(lambda: ColumnMoments.of(rows), DataError, message)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.support.refusals import refused
 from tpgmm_torch import AbsoluteOrientation, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
@@ -96,16 +97,13 @@ def test_zero_quaternions_are_refused() -> None:
 
 
 def test_wrong_joint_vectors_are_refused() -> None:
-    with pytest.raises(ShapeError, match=r"'left.qw'.*got \(13,\)"):
-        Poses().state(torch.zeros(13))
-    with pytest.raises(DataError, match="NaN"):
-        Poses().state(torch.full((14,), math.nan))
+    refused(lambda: Poses().state(torch.zeros(13)), ShapeError, r"'left.qw'.*got \(13,\)")
+    refused(lambda: Poses().state(torch.full((14,), math.nan)), DataError, "NaN")
 
 
 @pytest.mark.parametrize("links", ["left", (), ("left", "left")])
 def test_wrong_links_are_refused(links: Any) -> None:
-    with pytest.raises(DataError, match="links is a sequence of different names"):
-        Poses(links)
+    refused(lambda: Poses(links), DataError, "links is a sequence of different names")
 
 
 def test_made_in_inference_mode_it_serves_gradients() -> None:
@@ -141,8 +139,11 @@ class TestRecordedPoses:
         for shapes in ((4, 5), (4, None), ((2, 2), (2, 2)), ()):
             sizes = [(s,) if isinstance(s, int) else s or () for s in shapes]
             recorded = {str(i): Frame(torch.zeros(*size, 3)) for i, size in enumerate(sizes)}
-            with pytest.raises(ShapeError, match="one common leading shape"):
-                Poses.joints(recorded)
+            refused(
+                lambda recorded=recorded: Poses.joints(recorded),
+                ShapeError,
+                "one common leading shape",
+            )
 
 
 class TestObject:
@@ -156,8 +157,7 @@ class TestObject:
         ("change", "message"), [({"color": "red"}, "color"), ({"dtype": "int8"}, "int8")]
     )
     def test_a_tampered_config_is_refused(self, change: dict[str, Any], message: str) -> None:
-        with pytest.raises(DataError, match=message):
-            Poses.from_config(Poses().config() | change)
+        refused(lambda: Poses.from_config(Poses().config() | change), DataError, message)
 
     @pytest.mark.parametrize("copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
     def test_copies_are_equal_and_work(self, copied: Any) -> None:

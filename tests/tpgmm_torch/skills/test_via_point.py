@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.support.refusals import refused
 from tests.support.skills import small_bottle
 from tpgmm_torch import Frame, ViaPoints
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
@@ -27,8 +28,7 @@ def test_text_is_read_and_written(text):
     "text", ["", "3.2", "position:l_hand=0,0,0", "a:canonical=1", "1:canonical=x,y", "1:hand=0"]
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(DataError):
-        ViaPoint.parse(text)
+    refused(lambda: ViaPoint.parse(text), DataError)
 
 
 def test_a_frame_is_a_pose():
@@ -56,8 +56,7 @@ def test_some_joints_go_by_name():
     ],
 )
 def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
-    with pytest.raises(error, match=message):
-        ViaPoints(small_bottle().skill, [ViaPoint(*arguments)])
+    refused(lambda: ViaPoints(small_bottle().skill, [ViaPoint(*arguments)]), error, message)
 
 
 @pytest.mark.parametrize(
@@ -71,5 +70,4 @@ def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
     ],
 )
 def test_what_is_none_is_refused(arguments):
-    with pytest.raises(DataError):
-        ViaPoint(*arguments)
+    refused(lambda: ViaPoint(*arguments), DataError)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.refusals import refused
 from tests.support.skills import (
     HANDLING,
     HANDS,
@@ -108,8 +109,7 @@ def test_names_order_the_joints_of_all_batches():
 def test_a_batch_unlike_those_before_is_named(spoil, error, message):
     demonstrations = handlings(4)
     demonstrations[3] = spoil(demonstrations[3])
-    with pytest.raises(error, match=message):
-        hands_model().fit(Batches(demonstrations))
+    refused(lambda: hands_model().fit(Batches(demonstrations)), error, message)
 
 
 def test_uneven_batches_have_no_instants():
@@ -139,8 +139,7 @@ def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(
 
 
 def test_no_demonstrations_are_refused():
-    with pytest.raises(DataError, match="no demonstrations"):
-        hands_model().fit([[], []])
+    refused(lambda: hands_model().fit([[], []]), DataError, "no demonstrations")
 
 
 def test_episodes_of_a_data_set_are_batches(tmp_path):
@@ -154,8 +153,7 @@ def test_episodes_of_a_data_set_are_batches(tmp_path):
     again = [d for batch in batches for d in batch]
     assert len(batches) == 3 and len(again) == 5
     assert_same(canonical().fit(batches), canonical().fit(again))
-    with pytest.raises(ValueError, match="size=0"):
-        EpisodeBatches(path, 0)
+    refused(lambda: EpisodeBatches(path, 0), ValueError, "size=0")
 
 
 def test_a_few_points_have_the_moments_of_many():
