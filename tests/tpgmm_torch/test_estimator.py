@@ -280,19 +280,15 @@ def test_what_a_model_cannot_learn_from_is_refused(given, error, parts):
 
 
 @pytest.mark.parametrize("method", ["fit", "score"])
-@pytest.mark.parametrize(
-    ("given", "parts"),
-    [
-        (None, ["list", "NoneType"]),
-        (7, ["list", "int"]),
-        ([], ["empty"]),
-        (waves(1)[0], ["[demonstration]"]),
-        ([waves(1)[0], 3], ["item 1", "int"]),
-        (np.zeros((5, 2)), ["item 0", "ndarray"]),
-        ([Situation([0.0, 0.0, 0.0])], ["item 0", "Situation"]),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("given", "parts"), [
+    (None, ["list", "NoneType"]),
+    (7, ["list", "int"]),
+    ([], ["empty"]),
+    (waves(1)[0], ["[demonstration]"]),
+    ([waves(1)[0], 3], ["item 1", "int"]),
+    (np.zeros((5, 2)), ["item 0", "ndarray"]),
+    ([Situation([0.0, 0.0, 0.0])], ["item 0", "Situation"]),
+], ids=str)  # fmt: skip
 def test_what_is_no_list_of_demonstrations_is_refused(method, given, parts):
     model = joints_only().fit(waves())
     refused(lambda: getattr(model, method)(given), DataError, *parts)
@@ -361,19 +357,15 @@ def test_one_instant_is_not_enough():
 # Asking a model
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        lambda m: m.predict([Situation([0.0, 0.0, 0.0])]),
-        lambda m: m.step(0.0, [0.0, 0.0, 0.0]),
-        lambda m: m.sample(Situation([0.0, 0.0, 0.0])),
-        lambda m: m.score(waves()),
-        lambda m: m.score_samples(waves()),
-        lambda m: m.skill,
-        lambda m: save(m, "nowhere"),
-    ],
-    ids=["predict", "step", "sample", "score", "score_samples", "skill", "save"],
-)
+@pytest.mark.parametrize("ask", [
+    lambda m: m.predict([Situation([0.0, 0.0, 0.0])]),
+    lambda m: m.step(0.0, [0.0, 0.0, 0.0]),
+    lambda m: m.sample(Situation([0.0, 0.0, 0.0])),
+    lambda m: m.score(waves()),
+    lambda m: m.score_samples(waves()),
+    lambda m: m.skill,
+    lambda m: save(m, "nowhere"),
+], ids=["predict", "step", "sample", "score", "score_samples", "skill", "save"])  # fmt: skip
 def test_an_unfitted_model_says_so(ask):
     refused(lambda: ask(joints_only()), NotFittedError, "not fitted yet", "fit(demonstrations)")
     assert issubclass(NotFittedError, SklearnNotFittedError)

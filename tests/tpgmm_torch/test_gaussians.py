@@ -209,17 +209,13 @@ SINGULAR = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
 REGULAR = torch.eye(2, dtype=torch.float64)
 
 
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda c: gaussians.cholesky(c, "the thing"), "the thing"),
-        (lambda c: gaussians.product(torch.zeros(2, 2).double(), c), "a factor of the product"),
-        (lambda c: gaussians.information(None, torch.zeros(2, 1).double(), c), "projected"),
-        (lambda c: gaussians.information(REGULAR, torch.zeros(2, 1).double(), c), "projected"),
-        (lambda c: gaussians.from_information(c, torch.zeros(2, 2).double()), "precision"),
-    ],
-    ids=["cholesky", "product", "information", "information with J", "from_information"],
-)
+@pytest.mark.parametrize(("call", "name"), [
+    (lambda c: gaussians.cholesky(c, "the thing"), "the thing"),
+    (lambda c: gaussians.product(torch.zeros(2, 2).double(), c), "a factor of the product"),
+    (lambda c: gaussians.information(None, torch.zeros(2, 1).double(), c), "projected"),
+    (lambda c: gaussians.information(REGULAR, torch.zeros(2, 1).double(), c), "projected"),
+    (lambda c: gaussians.from_information(c, torch.zeros(2, 2).double()), "precision"),
+], ids=["cholesky", "product", "information", "with J", "from_information"])  # fmt: skip
 @pytest.mark.parametrize("bad", [SINGULAR - 1e-3 * REGULAR, torch.full((2, 2), torch.nan)])
 def test_a_singular_matrix_is_named_counted_and_comes_with_advice(call, name, bad):
     with pytest.raises(DataError, match=rf"{name}.*1 of 2 matrices of size 2.*reg_covar"):

@@ -147,16 +147,13 @@ def test_instants_are_named_or_given():
     assert pose_errors(late, one, HANDS, "left").position.shape == (1,)
 
 
-@pytest.mark.parametrize(
-    ("at", "options", "error", "message"),
-    [
-        ("grasp", {}, UnknownNameError, r"event 'grasp' is not in the dem.*'close'"),
-        (2.5, {}, DataError, r"\[2.5\] s lie outside the demonstration, 0 to 2 s"),
-        (float("nan"), {}, DataError, "NaN"),
-        ([], {}, DataError, "outside"),
-        (0.5, {"link": "hand"}, UnknownNameError, "'hand'.*'left', 'right'"),
-    ],
-)
+@pytest.mark.parametrize(("at", "options", "error", "message"), [
+    ("grasp", {}, UnknownNameError, r"event 'grasp' is not in the dem.*'close'"),
+    (2.5, {}, DataError, r"\[2.5\] s lie outside the demonstration, 0 to 2 s"),
+    (float("nan"), {}, DataError, "NaN"),
+    ([], {}, DataError, "outside"),
+    (0.5, {"link": "hand"}, UnknownNameError, "'hand'.*'left', 'right'"),
+])  # fmt: skip
 def test_instants_that_are_none_are_refused(at, options, error, message):
     shown = replace(handlings(1)[0], events={"close": 0.7})
     found = trajectory(shown.time, shown.joints, HANDS.joint_names)

@@ -113,16 +113,13 @@ def test_from_matrix_refuses_other_shapes(shape):
     refused(lambda: Q.from_matrix(torch.zeros(shape)), ShapeError, r"\(\.\.\., 3, 3\), got")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda m: 1.01 * m, "R\\^T R differs from the identity by 0.02"),
-        (lambda m: -m, "a reflection"),
-        (lambda m: torch.full_like(m, torch.nan), "no rotation"),
-        (lambda m: torch.zeros_like(m), "no rotation"),
-        (lambda m: torch.stack((m, m.flip(-1))), "reflection"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda m: 1.01 * m, "R\\^T R differs from the identity by 0.02"),
+    (lambda m: -m, "a reflection"),
+    (lambda m: torch.full_like(m, torch.nan), "no rotation"),
+    (lambda m: torch.zeros_like(m), "no rotation"),
+    (lambda m: torch.stack((m, m.flip(-1))), "reflection"),
+])  # fmt: skip
 def test_from_matrix_refuses_what_is_no_rotation(change, message):
     turn = Q.to_matrix(Q.exp(torch.tensor([0.3, -1.0, 0.2], dtype=torch.float64)))
     refused(lambda: Q.from_matrix(change(turn)), DataError, message)

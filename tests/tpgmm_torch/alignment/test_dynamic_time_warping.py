@@ -148,16 +148,13 @@ def test_one_demonstration_alone_stays_itself(reference):
     torch.testing.assert_close(aligned.joints, own.joints, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "parameters, error, message",
-    [
-        ({"features": ["elbow"]}, UnknownNameError, "'elbow' is not in the features; it has"),
-        ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
-        ({"reference": "mean"}, ValueError, "reference"),
-        ({"max_slope": 1.5}, ValueError, "max_slope"),
-        ({"min_gain": "linear"}, ValueError, "min_gain"),
-    ],
-)
+@pytest.mark.parametrize("parameters, error, message", [
+    ({"features": ["elbow"]}, UnknownNameError, "'elbow' is not in the features; it has"),
+    ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
+    ({"reference": "mean"}, ValueError, "reference"),
+    ({"max_slope": 1.5}, ValueError, "max_slope"),
+    ({"min_gain": "linear"}, ValueError, "min_gain"),
+])  # fmt: skip
 def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
     refused(lambda: DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2]), error, message)
 

@@ -98,14 +98,11 @@ def test_quaternions_are_found_by_the_names_of_the_joints():
         quaternion_columns(own.reorder(names[:3]), poses)
 
 
-@pytest.mark.parametrize(
-    "names, left",
-    [
-        (None, ("directions",)),
-        (["directions"], ("speed", "joints", "elbow", "hand")),
-        (["hand in bottle"], ("speed", "joints", "directions", "elbow", "hand")),
-    ],
-)
+@pytest.mark.parametrize("names, left", [
+    (None, ("directions",)),
+    (["directions"], ("speed", "joints", "elbow", "hand")),
+    (["hand in bottle"], ("speed", "joints", "directions", "elbow", "hand")),
+])  # fmt: skip
 def test_the_others_are_what_is_not_used(names, left):
     family = DEMONSTRATIONS[:2]
     features = AlignmentFeatures.fit(family, Arm(), names)

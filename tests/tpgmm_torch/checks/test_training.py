@@ -121,18 +121,15 @@ def test_few_demonstrations(n, correlated, few):
     assert found(waves(2), SPACE, [Canonical()], correlated=True) == []  # which has no frames
 
 
-@pytest.mark.parametrize(
-    ("operator", "active"),
-    [
-        (PUT, False),
-        (AbsolutePosition("cup"), False),
-        (RelativeOrientation("cup", "tray", held=True), False),
-        (RelativePosition("cup", "hand"), True),  # the hand moves
-        (RelativePosition("hand", "cup"), True),
-        (RelativePosition("hand", "cup", held=True), True),
-        (Canonical(), True),
-    ],
-)
+@pytest.mark.parametrize(("operator", "active"), [
+    (PUT, False),
+    (AbsolutePosition("cup"), False),
+    (RelativeOrientation("cup", "tray", held=True), False),
+    (RelativePosition("cup", "hand"), True),  # the hand moves
+    (RelativePosition("hand", "cup"), True),
+    (RelativePosition("hand", "cup", held=True), True),
+    (Canonical(), True),
+])  # fmt: skip
 def test_an_object_that_never_moves_constrains_no_joint_until_it_is_held(operator, active):
     operators, shown = [Stack(operator, RelativePosition("hand", "tray"))], carrying(False)
     assert bool(found(shown, HAND, operators)) != active

@@ -57,15 +57,12 @@ def test_rounded_quaternions_are_brought_to_unit_norm():
     assert given.tolist() == [0.7071, 0.0, 0.0, 0.7071]
 
 
-@pytest.mark.parametrize(
-    ("position", "orientation", "message"),
-    [
-        (1.0, None, r"position has shape \(\.\.\., 3\), got \(\)"),
-        ([1.0, 2.0], None, r"position has shape \(\.\.\., 3\), got \(2,\)"),
-        ([0.0] * 3, [1.0, 0.0, 0.0], r"an orientation of shape \(4,\), got \(3,\)"),
-        (np.zeros((5, 3)), [1.0, 0, 0, 0], r"orientation of shape \(5, 4\), got \(4,\)"),
-    ],
-)
+@pytest.mark.parametrize(("position", "orientation", "message"), [
+    (1.0, None, r"position has shape \(\.\.\., 3\), got \(\)"),
+    ([1.0, 2.0], None, r"position has shape \(\.\.\., 3\), got \(2,\)"),
+    ([0.0] * 3, [1.0, 0.0, 0.0], r"an orientation of shape \(4,\), got \(3,\)"),
+    (np.zeros((5, 3)), [1.0, 0, 0, 0], r"orientation of shape \(5, 4\), got \(4,\)"),
+])  # fmt: skip
 def test_frames_refuse_wrong_shapes(position, orientation, message):
     refused(lambda: Frame(position, orientation), ShapeError, message)
 

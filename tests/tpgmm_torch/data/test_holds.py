@@ -50,16 +50,13 @@ def test_the_end_is_after_the_beginning(times):
         Hold("bottle", "l_hand", *times)
 
 
-@pytest.mark.parametrize(
-    ("hold", "message"),
-    [
-        (("", "l_hand"), "the frame of a hold is a name, got ''"),
-        (("bottle", None), "the link of a hold is a name, got None"),
-        (("bottle", "bottle"), "'bottle' cannot hold itself"),
-        (("bottle", "l_hand", math.nan), "the begin of bottle@l_hand is a number"),
-        (("bottle", "l_hand", 1.0, "late"), "the end of bottle@l_hand is a number"),
-    ],
-)
+@pytest.mark.parametrize(("hold", "message"), [
+    (("", "l_hand"), "the frame of a hold is a name, got ''"),
+    (("bottle", None), "the link of a hold is a name, got None"),
+    (("bottle", "bottle"), "'bottle' cannot hold itself"),
+    (("bottle", "l_hand", math.nan), "the begin of bottle@l_hand is a number"),
+    (("bottle", "l_hand", 1.0, "late"), "the end of bottle@l_hand is a number"),
+])  # fmt: skip
 def test_names_are_names_and_times_are_times(hold, message):
     refused(lambda: Hold(*hold), DataError, message)
 

@@ -342,34 +342,28 @@ def test_a_gpu_gives_the_same_mixture(clusters):
     np.testing.assert_allclose(model.score_samples(clusters), reference.score_samples(clusters))
 
 
-@pytest.mark.parametrize(
-    ("settings", "error", "message"),
-    [
-        ({"blocks": (2, 2)}, ShapeError, r"blocks=\(2, 2\) add up to 4 .* have 5"),
-        ({"blocks": (5, 0)}, ShapeError, "positive integers"),
-        ({"n_components": 301}, DataError, "n_components=301.*300 distinct.*n_samples = 300"),
-        ({"reg_covar": [1.0, 2.0]}, ShapeError, r"one for each of the 5 .*shape \(2,\)"),
-        ({"reg_covar": [0.0, 0.0, -1e-9, 0.0, 0.0]}, DataError, "finite and not negative"),
-        ({"covariance_type": "band"}, ValueError, "covariance_type"),
-        ({"init_params": "guess"}, ValueError, "init_params"),
-        ({"reg_covar": -1.0}, ValueError, "reg_covar"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "error", "message"), [
+    ({"blocks": (2, 2)}, ShapeError, r"blocks=\(2, 2\) add up to 4 .* have 5"),
+    ({"blocks": (5, 0)}, ShapeError, "positive integers"),
+    ({"n_components": 301}, DataError, "n_components=301.*300 distinct.*n_samples = 300"),
+    ({"reg_covar": [1.0, 2.0]}, ShapeError, r"one for each of the 5 .*shape \(2,\)"),
+    ({"reg_covar": [0.0, 0.0, -1e-9, 0.0, 0.0]}, DataError, "finite and not negative"),
+    ({"covariance_type": "band"}, ValueError, "covariance_type"),
+    ({"init_params": "guess"}, ValueError, "init_params"),
+    ({"reg_covar": -1.0}, ValueError, "reg_covar"),
+])  # fmt: skip
 def test_bad_settings_are_named(clusters, settings, error, message):
     with pytest.raises(error, match=message):
         BlockGaussianMixture(**{"n_components": 3, **settings}).fit(clusters)
 
 
-@pytest.mark.parametrize(
-    ("changed", "error", "message"),
-    [
-        ({"weights": [0.5, 0.5, 0.5]}, DataError, "add up to 1"),
-        ({"weights": [0.5, np.nan, 0.5]}, DataError, "NaN"),
-        ({"means": [np.zeros((2, 2)), np.zeros((3, 3))]}, ShapeError, r"got .*\(2, 2\)"),
-        ({"means": [np.zeros((3, 2))]}, ShapeError, "have the shapes"),
-        ({"covariances": [np.zeros((3, 2, 2)), np.zeros((3, 3, 3))]}, DataError, "component 0"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "error", "message"), [
+    ({"weights": [0.5, 0.5, 0.5]}, DataError, "add up to 1"),
+    ({"weights": [0.5, np.nan, 0.5]}, DataError, "NaN"),
+    ({"means": [np.zeros((2, 2)), np.zeros((3, 3))]}, ShapeError, r"got .*\(2, 2\)"),
+    ({"means": [np.zeros((3, 2))]}, ShapeError, "have the shapes"),
+    ({"covariances": [np.zeros((3, 2, 2)), np.zeros((3, 3, 3))]}, DataError, "component 0"),
+])  # fmt: skip
 def test_parameters_that_are_no_mixture_are_refused(changed, error, message):
     given = {
         "weights": np.array([0.2, 0.3, 0.5]),

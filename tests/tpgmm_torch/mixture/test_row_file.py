@@ -80,16 +80,13 @@ def with_nan(piece):
     return piece
 
 
-@pytest.mark.parametrize(
-    ("spoil", "error", "message"),
-    [
-        (with_nan, DataError, "batch 2: .*NaN"),
-        (lambda piece: piece[:, :4], ShapeError, "batch 2 has 4 columns.* before have 5"),
-        (lambda piece: piece[:, 0], DataError, "batch 2: .*2D"),
-        (lambda piece: np.char.add(piece.astype(str), "x"), DataError, "batch 2: .*string"),
-        (lambda piece: None, DataError, "batch 2: "),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "error", "message"), [
+    (with_nan, DataError, "batch 2: .*NaN"),
+    (lambda piece: piece[:, :4], ShapeError, "batch 2 has 4 columns.* before have 5"),
+    (lambda piece: piece[:, 0], DataError, "batch 2: .*2D"),
+    (lambda piece: np.char.add(piece.astype(str), "x"), DataError, "batch 2: .*string"),
+    (lambda piece: None, DataError, "batch 2: "),
+])  # fmt: skip
 def test_a_bad_batch_is_named(timed_rows, spoil, error, message):
     pieces = np.split(timed_rows, [500, 1000, 2000])
     pieces[2] = spoil(pieces[2])

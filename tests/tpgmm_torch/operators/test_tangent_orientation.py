@@ -105,15 +105,12 @@ def test_a_path_asks_for_the_time():
         operator.coordinates(OnRobot().scene()[0], {})
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"geometry": "sphere"}, "'quaternion', 'tangent'"),
-        ({"geometry": "tangent", "gain": 1.0}, "gain=1.0"),
-        ({"path": ((0.0, 1.0, 0.0, 0.0, 0.0),)}, "geometry='tangent'"),
-        ({"geometry": "tangent", "path": ((0.0, 1.0, 0.0),)}, "w, x, y, z"),
-        ({"geometry": "tangent", "path": ()}, "w, x, y, z"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"geometry": "sphere"}, "'quaternion', 'tangent'"),
+    ({"geometry": "tangent", "gain": 1.0}, "gain=1.0"),
+    ({"path": ((0.0, 1.0, 0.0, 0.0, 0.0),)}, "geometry='tangent'"),
+    ({"geometry": "tangent", "path": ((0.0, 1.0, 0.0),)}, "w, x, y, z"),
+    ({"geometry": "tangent", "path": ()}, "w, x, y, z"),
+])  # fmt: skip
 def test_what_contradicts_itself_is_refused(settings, message):
     refused(lambda: AbsoluteOrientation(LEFT, **settings), DataError, message)

@@ -82,20 +82,17 @@ def test_an_operator_of_ones_own_goes_by_its_repr():
     assert format_operator(Height("hand", floor=0.1)) == repr(Height("hand", floor=0.1))
 
 
-@pytest.mark.parametrize(
-    ("links", "frames", "expected"),
-    [
-        ([], ["bottle"], ["canonical"]),
-        (["hand"], [], ["pose:hand", "canonical"]),
-        (
-            ["left", "right"],
-            ["bottle", "cup"],
-            [
-                "pose:left@bottle + pose:right@bottle + pose:left@cup + pose:right@cup",
-                "canonical",
-            ],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("links", "frames", "expected"), [
+    ([], ["bottle"], ["canonical"]),
+    (["hand"], [], ["pose:hand", "canonical"]),
+    (
+        ["left", "right"],
+        ["bottle", "cup"],
+        [
+            "pose:left@bottle + pose:right@bottle + pose:left@cup + pose:right@cup",
+            "canonical",
+        ],
+    ),
+])  # fmt: skip
 def test_by_default_all_links_are_seen_from_all_frames(links, frames, expected):
     assert default_operators(links, frames) == [parse_operator(text) for text in expected]

@@ -109,17 +109,14 @@ def test_every_form_is_saved_and_serves(tmp_path):
         assert not torch.equal(narrow.joints, expected.joints)
 
 
-@pytest.mark.parametrize(
-    ("prior_std", "error", "message"),
-    [
-        ({"left.w": 1.0}, UnknownNameError, "'left.w'"),
-        ({"left.x": -1.0}, DataError, "must be positive"),
-        ({"left.x": float("nan")}, DataError, "NaN"),
-        ([1.0, 2.0], ShapeError, r"got shape \(2,\)"),
-        ([0.0] * 14, DataError, "must be positive"),
-        ({"left.x": [1.0, 2.0]}, ShapeError, "one number"),
-    ],
-)
+@pytest.mark.parametrize(("prior_std", "error", "message"), [
+    ({"left.w": 1.0}, UnknownNameError, "'left.w'"),
+    ({"left.x": -1.0}, DataError, "must be positive"),
+    ({"left.x": float("nan")}, DataError, "NaN"),
+    ([1.0, 2.0], ShapeError, r"got shape \(2,\)"),
+    ([0.0] * 14, DataError, "must be positive"),
+    ({"left.x": [1.0, 2.0]}, ShapeError, "one number"),
+])  # fmt: skip
 def test_what_is_no_width_is_refused(prior_std, error, message):
     with pytest.raises(error, match=message):
         hands_model(fusion=InformationFusion(prior_std)).fit(handlings())

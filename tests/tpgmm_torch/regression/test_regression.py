@@ -68,24 +68,20 @@ def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion
 
 
 @FORMS
-@pytest.mark.parametrize(
-    "case",
-    [
-        CASES["the paper's"],
-        CASES["three"],
-        Case(
-            OnRobot(),
-            [Stack(RelativePosition(LEFT, OBJECT), Canonical()), AbsolutePosition(RIGHT)],
-            lambda at: [
-                oracles.stack(
-                    oracles.relative_position(at, LEFT, OBJECT), oracles.canonical(at)
-                ),
-                oracles.absolute_position(at, RIGHT),
-            ],
-        ),
-    ],
-    ids=["the paper's", "three", "stacked"],
-)
+@pytest.mark.parametrize("case", [
+    CASES["the paper's"],
+    CASES["three"],
+    Case(
+        OnRobot(),
+        [Stack(RelativePosition(LEFT, OBJECT), Canonical()), AbsolutePosition(RIGHT)],
+        lambda at: [
+            oracles.stack(
+                oracles.relative_position(at, LEFT, OBJECT), oracles.canonical(at)
+            ),
+            oracles.absolute_position(at, RIGHT),
+        ],
+    ),
+], ids=["the paper's", "three", "stacked"])  # fmt: skip
 def test_joints_give_way_by_what_few_samples_leave_unknown(case, activation, fusion):
     problem = Problem.of(case, 3)
     how = {"fusion": form(fusion, activation, EPSILON)}

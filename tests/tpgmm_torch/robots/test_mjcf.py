@@ -92,17 +92,14 @@ class TestAgainstMuJoCo:
         assert largest_difference(model, urdf, "world", 50) < 1e-13
         assert largest_difference(model, urdf, "forearm", 20) < 1e-13
 
-    @pytest.mark.parametrize(
-        ("package", "path", "base"),
-        [
-            ("gym_aloha", "assets/bimanual_viperx_transfer_cube.xml", "world"),
-            ("dm_control", "suite/humanoid_CMU.xml", "root"),
-            ("dm_control", "suite/manipulator.xml", "world"),
-            ("dm_control", "third_party/kinova/jaco_arm.xml", "world"),
-            ("gymnasium", "envs/mujoco/assets/humanoid.xml", "torso"),
-            ("gymnasium", "envs/mujoco/assets/pusher_v5.xml", "world"),
-        ],
-    )
+    @pytest.mark.parametrize(("package", "path", "base"), [
+        ("gym_aloha", "assets/bimanual_viperx_transfer_cube.xml", "world"),
+        ("dm_control", "suite/humanoid_CMU.xml", "root"),
+        ("dm_control", "suite/manipulator.xml", "world"),
+        ("dm_control", "third_party/kinova/jaco_arm.xml", "world"),
+        ("gymnasium", "envs/mujoco/assets/humanoid.xml", "torso"),
+        ("gymnasium", "envs/mujoco/assets/pusher_v5.xml", "world"),
+    ])  # fmt: skip
     def test_models_of_other_packages_agree(self, package: str, path: str, base: str) -> None:
         found = importlib.util.find_spec(package)
         if found is None or found.origin is None:

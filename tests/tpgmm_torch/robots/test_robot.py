@@ -314,15 +314,12 @@ class TestObject:
         joints = torch.ones(2, 3)
         assert (other.state(joints).positions == robot.state(joints).positions).all()
 
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"color": "red"}, "color"),
-            ({"dtype": "int8"}, "int8"),
-            ({"urdf": "robot.urdf"}, "not a path"),
-            ({"links": ["cup", "nose"]}, "nose"),
-        ],
-    )
+    @pytest.mark.parametrize(("change", "message"), [
+        ({"color": "red"}, "color"),
+        ({"dtype": "int8"}, "int8"),
+        ({"urdf": "robot.urdf"}, "not a path"),
+        ({"links": ["cup", "nose"]}, "nose"),
+    ])  # fmt: skip
     def test_a_tampered_config_is_refused(
         self, robot: Robot, change: dict[str, Any], message: str
     ) -> None:
@@ -444,31 +441,28 @@ class TestCombining:
 
 
 class TestErrors:
-    @pytest.mark.parametrize(
-        ("settings", "error", "message"),
-        [
-            ({"links": "tip"}, DataError, "links is a sequence of names, got 'tip'"),
-            ({"links": ("tip", "tip")}, DataError, "links names something twice"),
-            ({"links": ("nose",)}, UnknownNameError, "link 'nose' is not in .* 'flange'"),
-            ({"base": "nose"}, UnknownNameError, "base link 'nose' is not in the URDF"),
-            ({"joints": ["lift", "knee"]}, UnknownNameError, "'knee' is not in .*'elbow'"),
-            ({"joints": ["weld"]}, UnknownNameError, "'weld' is not in the movable joints"),
-            ({"joints": ["lift", "lift"]}, DataError, "joints names something twice"),
-            ({"joints": ["wag_too"]}, DataError, "mimics 'elbow'.* choose or lock 'elbow'"),
-            ({"locked": {"knee": 0.0}}, UnknownNameError, "joint 'knee'"),
-            ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
-            ({"locked": {"lift": math.nan}}, DataError, "finite numbers, got .*'lift': nan"),
-            ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
-            ({"coordinates": ["elbow"]}, DataError, "'elbow' moves link 'tip'.* of its own"),
-            ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
-            ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
-            ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),
-            ({"tools": {"cup": ("arm", np.zeros((2, 3)))}}, ShapeError, "one constant pose"),
-            ({"tools": {"cup": ("arm", [0, 0])}}, ShapeError, "position"),
-            ({"tools": {"cup": "arm"}}, DataError, "tool 'cup' is"),
-            ({"dtype": torch.float16}, DataError, "float16"),
-        ],
-    )
+    @pytest.mark.parametrize(("settings", "error", "message"), [
+        ({"links": "tip"}, DataError, "links is a sequence of names, got 'tip'"),
+        ({"links": ("tip", "tip")}, DataError, "links names something twice"),
+        ({"links": ("nose",)}, UnknownNameError, "link 'nose' is not in .* 'flange'"),
+        ({"base": "nose"}, UnknownNameError, "base link 'nose' is not in the URDF"),
+        ({"joints": ["lift", "knee"]}, UnknownNameError, "'knee' is not in .*'elbow'"),
+        ({"joints": ["weld"]}, UnknownNameError, "'weld' is not in the movable joints"),
+        ({"joints": ["lift", "lift"]}, DataError, "joints names something twice"),
+        ({"joints": ["wag_too"]}, DataError, "mimics 'elbow'.* choose or lock 'elbow'"),
+        ({"locked": {"knee": 0.0}}, UnknownNameError, "joint 'knee'"),
+        ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
+        ({"locked": {"lift": math.nan}}, DataError, "finite numbers, got .*'lift': nan"),
+        ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
+        ({"coordinates": ["elbow"]}, DataError, "'elbow' moves link 'tip'.* of its own"),
+        ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
+        ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
+        ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),
+        ({"tools": {"cup": ("arm", np.zeros((2, 3)))}}, ShapeError, "one constant pose"),
+        ({"tools": {"cup": ("arm", [0, 0])}}, ShapeError, "position"),
+        ({"tools": {"cup": "arm"}}, DataError, "tool 'cup' is"),
+        ({"dtype": torch.float16}, DataError, "float16"),
+    ])  # fmt: skip
     def test_wrong_settings(
         self, settings: dict[str, Any], error: type[Exception], message: str
     ) -> None:

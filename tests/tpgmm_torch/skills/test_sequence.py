@@ -129,15 +129,12 @@ def test_a_line_of_text_is_a_sequence():
         refused(lambda wrong=wrong: Sequence.parse(wrong, skills()), UnknownNameError, message)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"until": ["held"]}, "until has 1 entries for 2 skills"),
-        ({"retry": [-1, 0]}, "a number of times"),
-        ({"timeout": 0.0}, "a positive fade and timeout"),
-        ({"fade": float("nan")}, "a positive fade and timeout"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"until": ["held"]}, "until has 1 entries for 2 skills"),
+    ({"retry": [-1, 0]}, "a number of times"),
+    ({"timeout": 0.0}, "a positive fade and timeout"),
+    ({"fade": float("nan")}, "a positive fade and timeout"),
+])  # fmt: skip
 def test_what_makes_no_sequence_is_refused(options, message):
     refused(lambda: Sequence((of("pick"), of("home")), **options), DataError, message)
     with pytest.raises(UnknownNameError, match=r"condition 3 .* a function"):

@@ -98,14 +98,11 @@ def test_names_order_the_joints_of_all_batches():
     assert_same(canonical().fit(Batches(turned)), canonical().fit(named))
 
 
-@pytest.mark.parametrize(
-    ("spoil", "error", "message"),
-    [
-        (lambda d: replace(d, frames={}), DataError, "batch 1 of .*frames"),
-        (lambda d: Demonstration(d.time, d.joints[:, :1], d.frames), ShapeError, ".* joints"),
-        (lambda d: "a demonstration", DataError, "batch 1 of .*is str"),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "error", "message"), [
+    (lambda d: replace(d, frames={}), DataError, "batch 1 of .*frames"),
+    (lambda d: Demonstration(d.time, d.joints[:, :1], d.frames), ShapeError, ".* joints"),
+    (lambda d: "a demonstration", DataError, "batch 1 of .*is str"),
+])  # fmt: skip
 def test_a_batch_unlike_those_before_is_named(spoil, error, message):
     demonstrations = handlings(4)
     demonstrations[3] = spoil(demonstrations[3])
