@@ -24,7 +24,7 @@ from tests.support.carrying import (
     held_carries,
     operators,
 )
-from tests.support.mixtures import both_hands
+from tests.support.mixtures import CASES
 from tests.support.skills import (
     HANDLING,
     HANDS,
@@ -578,7 +578,7 @@ def test_a_fitted_model_answers_as_table_i_says(fusion):
     answer = oracles.regress(
         float(demonstration.time[12]),
         at.joints,
-        [both_hands(at), oracles.canonical(at)],
+        CASES["the paper's"].rows(at),
         mixtures,
         model.weights_.numpy(),
         activation=getattr(fusion, "activation", "time"),

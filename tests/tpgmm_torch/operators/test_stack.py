@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.support import oracles
+from tests.support.mixtures import BOTH_HANDS
 from tests.support.operator_battery import OrientationLaws, RelativeLaws
 from tests.support.refusals import refused
 from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, upper_body
@@ -24,20 +25,7 @@ from tpgmm_torch.robots.kinematics import JointSpace
 class BothHandsLaws(RelativeLaws, OrientationLaws):
     """The paper's first operator, eqs (16), (17)."""
 
-    operator = Stack(
-        RelativePosition(LEFT, OBJECT),
-        RelativeOrientation(LEFT, OBJECT),
-        RelativePosition(RIGHT, OBJECT),
-        RelativeOrientation(RIGHT, OBJECT),
-    )
-
-    def row(self, at):
-        return oracles.stack(
-            oracles.relative_position(at, LEFT, OBJECT),
-            oracles.relative_orientation(at, LEFT, OBJECT),
-            oracles.relative_position(at, RIGHT, OBJECT),
-            oracles.relative_orientation(at, RIGHT, OBJECT),
-        )
+    operator = BOTH_HANDS
 
 
 class TestBothHandsOnRobot(OnRobot, BothHandsLaws):
@@ -63,15 +51,6 @@ class MixedStackLaws(OrientationLaws):
         Stack(AbsolutePosition(RIGHT), RelativeOrientation(LEFT, RIGHT)),
         RelativePosition(RIGHT, LEFT),
     )
-
-    def row(self, at):
-        return oracles.stack(
-            oracles.canonical(at),
-            oracles.absolute_orientation(at, LEFT),
-            oracles.absolute_position(at, RIGHT),
-            oracles.relative_orientation(at, LEFT, RIGHT),
-            oracles.relative_position(at, RIGHT, LEFT),
-        )
 
 
 class TestMixedStackOnRobot(OnRobot, MixedStackLaws):

@@ -38,7 +38,7 @@ PLACES = {
     "CarriedToPlace": ([CarryingOnRobot], CARRIED, OBJECT),
 }
 KINDS = AbsoluteOrientation, RelativeOrientation
-globals().update(laws_in_places(KINDS, (row, row), OrientationLaws, PLACES, geometry="tangent"))
+globals().update(laws_in_places(KINDS, OrientationLaws, PLACES, (row, row), geometry="tangent"))
 
 
 class TestInAStackOnRobot(OnRobot, RelativeLaws, OrientationLaws):
