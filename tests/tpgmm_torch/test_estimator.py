@@ -591,13 +591,9 @@ def test_a_fitted_model_answers_as_table_i_says(fusion):
     assert apart(estimate.activation, torch.from_numpy(answer.activation)) < 1e-5
 
 
-def test_joints_of_few_demonstrations_give_way(tmp_path):
+def test_joints_of_few_demonstrations_give_way():
     model = small_bottle()
     assert model.skill.n_samples == 4
-    [bottle] = model.predict(few_bottles()[:1])
-    save(model, tmp_path / "model.safetensors")
-    [again] = load_model(tmp_path / "model.safetensors").predict(few_bottles()[:1])
-    assert torch.equal(again.joints, bottle.joints)
     # who says how covariances are shrunk is taken at the word
     for number in (0, 0.1):
         said = bottle_model(4, tol=1e-1, covariance_shrinkage=number).fit(few_bottles())
@@ -749,14 +745,6 @@ def test_bounds_of_a_motion_follow_what_was_demonstrated():
     assert torch.equal(model.skill.peaks[0], acceleration) and torch.equal(
         model.skill.peaks[1], jerk
     )
-
-
-def test_batches_tell_the_same_peaks():
-    shown = waves(4)
-    whole = canonical().fit(shown)
-    parts = canonical().fit([shown[:1], shown[1:]])
-    for one, other in zip(whole.skill.peaks, parts.skill.peaks, strict=True):
-        assert torch.equal(one, other) and bool((one > 0).all())
 
 
 # Objects that the robot holds

@@ -6,6 +6,7 @@ import torch
 
 from tests.support.blocks import WIDTHS, fitted
 from tests.support.refusals import refused
+from tests.support.skills import same
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile
@@ -28,10 +29,7 @@ def timed_rows():
 
 
 def assert_same(model, other, tolerance=1e-9):
-    close = {"rtol": tolerance, "atol": tolerance}
-    torch.testing.assert_close(model.weights_, other.weights_, **close)
-    torch.testing.assert_close(model.means_, other.means_, **close)
-    torch.testing.assert_close(model.covariances_, other.covariances_, **close)
+    same(model, other, tolerance)
     assert model.lower_bounds_ == pytest.approx(other.lower_bounds_, rel=tolerance)
     assert model.n_iter_ == other.n_iter_
 

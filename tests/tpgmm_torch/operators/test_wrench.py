@@ -15,7 +15,6 @@ from tpgmm_torch import TaskParameterizedGMM as Model
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Wrench
 from tpgmm_torch.operators.text import format_operator, parse_operator
-from tpgmm_torch.persistence import load, save
 
 HAND = Wrench("hand", "board")
 
@@ -68,13 +67,6 @@ def test_without_wrenches_a_controller_runs_the_joints_alone(model):
     for _ in range(50):
         assert torch.equal(given.step(0.01).reference, quiet.step(0.01).reference)
     assert given.contacts == {}
-
-
-def test_model_is_saved_and_scored_with_its_forces(model, tmp_path):
-    save(model, tmp_path / "model")
-    again = load(tmp_path / "model")
-    assert again.operators_ == model.operators_
-    assert again.score(wipes()) == pytest.approx(model.score(wipes()))
 
 
 def test_text_of_an_operator():

@@ -1,9 +1,6 @@
 """Robots of a URDF against pinocchio, MuJoCo, finite differences and closed forms."""
 
-import copy
-import json
 import math
-import pickle
 import random
 import re
 import time
@@ -283,50 +280,6 @@ class TestSettings:
             Robot.from_urdf(text, ("flange",))
 
 
-class TestObject:
-    @pytest.fixture
-    def robot(self) -> Robot:
-        tools = {"cup": ("flange", [0.1, 0.2, 0.3], [0.6, 0.0, 0.8001, 0.0])}
-        return zoo(
-            ("cup", "tip"),
-            joints=["elbow", "hand", "wag"],
-            locked={"lift": 0.2},
-            coordinates=["hand"],
-            base="column",
-            tools=tools,
-            dtype=torch.float32,
-        )
-
-    def test_config_is_json_and_gives_the_same_robot(self, robot: Robot) -> None:
-        again = Robot.from_config(json.loads(json.dumps(robot.config())))
-        assert again == robot
-        assert again.config() == robot.config()
-        assert (
-            again.state(torch.ones(3)).jacobians == robot.state(torch.ones(3)).jacobians
-        ).all()
-
-    @pytest.mark.parametrize(
-        "copied", [copy.copy, copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))]
-    )
-    def test_copies_are_equal_and_work(self, robot: Robot, copied: Any) -> None:
-        other = copied(robot)
-        assert other == robot and hash(other) == hash(robot)
-        joints = torch.ones(2, 3)
-        assert (other.state(joints).positions == robot.state(joints).positions).all()
-
-    @pytest.mark.parametrize(("change", "message"), [
-        ({"color": "red"}, "color"),
-        ({"dtype": "int8"}, "int8"),
-        ({"urdf": "robot.urdf"}, "not a path"),
-        ({"links": ["cup", "nose"]}, "nose"),
-    ])  # fmt: skip
-    def test_a_tampered_config_is_refused(
-        self, robot: Robot, change: dict[str, Any], message: str
-    ) -> None:
-        with pytest.raises((DataError, UnknownNameError), match=message):
-            Robot.from_config(robot.config() | change)
-
-
 def assert_moves_like(both: RobotState, arm: RobotState, pose: Frame, first: int) -> None:
     """The links of one robot of two, from ``first`` on, are those of the robot alone."""
     links = slice(first, first + len(arm.links))
@@ -389,12 +342,9 @@ class TestCombining:
         joints = random_joints(arm, 5)
         assert_moves_like(both.state(joints), arm.state(joints), self.right, 0)
 
-    def test_they_are_saved_and_combined_like_any_robot(self) -> None:
+    def test_they_are_combined_like_any_robot(self) -> None:
         both = Robot.combine({"left": self.left}, left=zoo(("tip",)), right=upper_body())
-        again = Robot.from_config(json.loads(json.dumps(both.config())))
-        assert again == both
         joints = random_joints(both, 3)
-        assert torch.equal(again.state(joints).jacobians, both.state(joints).jacobians)
         four = Robot.combine(near=both, far=both, poses={"far": self.right})
         assert four.joint_names[0] == "near_left_lift"
         assert_moves_like(four.state(joints.repeat(1, 2)), both.state(joints), self.right, 3)

@@ -1,9 +1,6 @@
 """Poses in place of a robot: the joint vector is the poses themselves."""
 
-import copy
-import json
 import math
-import pickle
 from typing import Any
 
 import pytest
@@ -144,24 +141,3 @@ class TestRecordedPoses:
                 ShapeError,
                 "one common leading shape",
             )
-
-
-class TestObject:
-    def test_config_is_json_and_gives_the_same_poses(self) -> None:
-        poses = Poses(("a", "b"), orientation=False, dtype=torch.float32)
-        again = Poses.from_config(json.loads(json.dumps(poses.config())))
-        assert again == poses and hash(again) == hash(poses)
-        assert again.lower.dtype == torch.float32
-
-    @pytest.mark.parametrize(
-        ("change", "message"), [({"color": "red"}, "color"), ({"dtype": "int8"}, "int8")]
-    )
-    def test_a_tampered_config_is_refused(self, change: dict[str, Any], message: str) -> None:
-        refused(lambda: Poses.from_config(Poses().config() | change), DataError, message)
-
-    @pytest.mark.parametrize("copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
-    def test_copies_are_equal_and_work(self, copied: Any) -> None:
-        poses = Poses()
-        other, joints = copied(poses), random_joints(poses)
-        assert other == poses
-        assert (other.state(joints).jacobians == poses.state(joints).jacobians).all()
