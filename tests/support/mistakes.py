@@ -125,12 +125,21 @@ def one(change, index=2, demonstrations=None):
 
 
 def joints(factor=1.0, columns=slice(None), add=0.0):
-    def change(item):
-        values = item.joints.clone()
+    def change(values):
         values[:, columns] = values[:, columns] * factor + add
+
+    return edit(change)
+
+
+def edit(change):
+    """Change the joints of a demonstration in place of a copy of them."""
+
+    def edited(item):
+        values = item.joints.clone()
+        change(values)
         return replace(item, joints=values)
 
-    return change
+    return edited
 
 
 def bottles(change):
@@ -576,36 +585,20 @@ def moving(start, step):
 STILL, ONES = "episode,x,y,z", ["0,0.3,0.1,0.0", "1,0.3,0.2,0.0", "2,0.4,0.2,0.0"]
 #: A table of a cup's poses beside a set of three episodes: name, header, rows, what is told.
 MEASURED = (
-    (
-        "an_episode_without_a_pose",
-        STILL,
-        ONES[:2],
-        r"episode 2: .* 0 rows for this .*--episodes",
-    ),
-    (
-        "two_poses_for_an_episode",
-        STILL,
-        [*ONES, ONES[1]],
-        r"episode 1: .*2 rows for this .*'time'",
-    ),
-    (
-        "episodes_from_one",
-        STILL,
-        ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
-        r"episodes 3, the set has 0 to 2",
-    ),
+    ("an_episode_without_a_pose", STILL, ONES[:2],
+     r"episode 2: .* 0 rows for this .*--episodes"),
+    ("two_poses_for_an_episode", STILL, [*ONES, ONES[1]],
+     r"episode 1: .*2 rows for this .*'time'"),
+    ("episodes_from_one", STILL, ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
+     r"episodes 3, the set has 0 to 2"),
     ("episodes_by_name", STILL, ["a,0,0,0", "b,0,0,0"], r"'episode' holds no numbers"),
     ("half_episodes", STILL, ["0.5,0,0,0"], r"episodes 0.5, the set has 0 to 2"),
     ("no_rows", STILL, [], r"no rows"),
     ("no_episodes", "x,y,z", ["0,0,0"], r"columns .* Name them episode"),
     ("no_height", "episode,x,y", ["0,0.3,0.1"], r"Name them episode, x, y, z"),
     ("half_a_quaternion", f"{STILL},qx,qy,qz", ["0,0,0,0,0,0,0"], r"qw, qx, qy, qz"),
-    (
-        "two_rotations",
-        f"{STILL},yaw,yaw_deg",
-        ["0,0,0,0,0,0"],
-        r"\['yaw_deg'\] are unknown or there twice",
-    ),
+    ("two_rotations", f"{STILL},yaw,yaw_deg", ["0,0,0,0,0,0"],
+     r"\['yaw_deg'\] are unknown or there twice"),
     ("semicolons", "episode;x;y;z;up", ["0;0;0;0;1"], r"\['up'\] are unknown"),
     ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"\['score'\] are unknown"),
     ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"'mug.z'\]. Name them .*cup.x"),
@@ -617,7 +610,7 @@ MEASURED = (
     ("milliseconds", "episode,time,x,y,z", moving(0, 20), r"from 0 to 160,.*in seconds"),
     ("time_of_day", "episode,time,x,y,z", moving(1.7e9, 0.02), r"from the start of each"),
     ("no_time_goes_by", "episode,time,x,y,z", moving(0.1, 0), r"time does not increase"),
-)
+)  # fmt: skip
 
 
 def load_measured(folder, header, rows):
@@ -654,34 +647,28 @@ def the_object_for_the_hand_that_held_it(_):
 
 @mistake("values", r"wraps: .*whole turn.*demonstration 2")
 def angles_that_wrap(_):
-    def wrap(item):
-        values = item.joints.clone()
+    def wrap(values):
         values[120:, 3] -= math.tau
-        return replace(item, joints=values)
 
-    lint(one(wrap, demonstrations=fine()))
+    lint(one(edit(wrap), demonstrations=fine()))
 
 
 @mistake("values", r"jumps: .*demonstration 2")
 def a_value_that_was_lost(_):
-    def spoil(item):
-        values = item.joints.clone()
+    def spoil(values):
         values[130, 5] += 0.6
-        return replace(item, joints=values)
 
-    lint(one(spoil, demonstrations=fine()))
+    lint(one(edit(spoil), demonstrations=fine()))
 
 
 @mistake("values", r"clipped: .*stop dead")
 def values_that_were_clipped(_):
-    def clip(item):
-        values = item.joints.clone()
+    def clip(values):
         for joint in (3, 10):
             high = torch.quantile(values[:, joint], 0.85)
             values[:, joint] = values[:, joint].clamp(max=float(high))
-        return replace(item, joints=values)
 
-    lint(each(clip, fine()))
+    lint(each(edit(clip), fine()))
 
 
 @mistake("values", r"stuck: .*demonstration 2")
@@ -691,12 +678,10 @@ def a_sensor_that_is_stuck(_):
 
 @mistake("values", r"stuck: .*demonstration 2")
 def a_sensor_that_freezes_half_way(_):
-    def freeze(item):
-        values = item.joints.clone()
+    def freeze(values):
         values[80:200, 3] = values[80, 3]
-        return replace(item, joints=values)
 
-    lint(one(freeze, demonstrations=fine()))
+    lint(one(edit(freeze), demonstrations=fine()))
 
 
 @mistake("values", r"episodes: .*demonstration 2")

@@ -60,41 +60,28 @@ def test_a_link_is_seen_from_another_like_from_an_object_but_moves_with_it(kind,
     assert not torch.allclose(link.linear(state, {}), thing.linear(state, there), atol=1e-2)
 
 
-LINKED = [
-    AbsolutePosition("elbow"),
-    AbsoluteOrientation("elbow"),
-    RelativePosition("elbow", OBJECT),
-    RelativeOrientation("elbow", OBJECT),
-    Stack(AbsolutePosition(LEFT), AbsolutePosition("elbow")),
-]
+LINK = r"'elbow' is not in the .*; it has \['l_hand', 'object', 'r_hand'\]"
+FRAME = r"frame 'cup' is not in .*\['l_hand', 'obj"
+UNKNOWN = [
+    (AbsolutePosition("elbow"), LINK, LINK),
+    (AbsoluteOrientation("elbow"), LINK, LINK),
+    (RelativePosition("elbow", OBJECT), LINK, LINK),
+    (RelativeOrientation("elbow", OBJECT), LINK, LINK),
+    (Stack(AbsolutePosition(LEFT), AbsolutePosition("elbow")), LINK, LINK),
+    (RelativePosition(LEFT, "cup"), r"frame 'cup' is not in .*\['object'", FRAME),
+    (RelativeOrientation(LEFT, "cup"), r"frame 'cup' is not in .*\['object'", FRAME),
+    (Stack(RelativePosition(LEFT, OBJECT), RelativePosition(LEFT, "cup")),
+     r"frame 'cup' is not in .*\['object'", FRAME),
+]  # fmt: skip
 
 
 @WORLDS
-@pytest.mark.parametrize("operator", LINKED, ids=repr)
-def test_an_unknown_link_is_named_with_those_that_exist(operator, world: World):
+@pytest.mark.parametrize(("operator", "at_once", "later"), UNKNOWN)
+def test_an_unknown_name_comes_with_those_that_exist(operator, at_once, later, world: World):
     state, frames = world.scene()
-    listed = r"'elbow' is not in the .*; it has \['l_hand', 'object', 'r_hand'\]"
-    refused(lambda: operator.check(world.kinematics, frames), UnknownNameError, listed)
-    for call in (operator.linearize, operator.coordinates):
-        refused(lambda call=call: call(state, frames), UnknownNameError, listed)
-
-
-FRAMED = [
-    RelativePosition(LEFT, "cup"),
-    RelativeOrientation(LEFT, "cup"),
-    Stack(RelativePosition(LEFT, OBJECT), RelativePosition(LEFT, "cup")),
-]
-
-
-@WORLDS
-@pytest.mark.parametrize("operator", FRAMED, ids=repr)
-def test_an_unknown_frame_is_named_with_those_that_exist(operator, world: World):
-    state, frames = world.scene()
-    with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['object'"):
-        operator.check(world.kinematics, frames)
-    for call in (operator.linearize, operator.coordinates):
-        with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['l_hand', 'obj"):
-            call(state, frames)
+    refused(lambda: operator.check(world.kinematics, frames), UnknownNameError, at_once)
+    refused(lambda: operator.linearize(state, frames), UnknownNameError, later)
+    refused(lambda: operator.coordinates(state, frames), UnknownNameError, later)
 
 
 @WORLDS
