@@ -208,7 +208,10 @@ def test_a_warning_names_via_points_out_of_reach():
     assert bool((speed <= bounds.velocity * 1.001).all())
 
 
-def test_a_fade_takes_time():
+def test_points_and_fade_are_kept_and_a_fade_takes_time():
+    point = ViaPoint(1.0, "position:left@cup", [0.1, 0.1, 0.2], 0.01)
+    model = ViaPoints(hands().skill, [point], fade=0.4)
+    assert model.points == (point,) and model.fade == 0.4
     refused(lambda: ViaPoints(hands().skill, [], fade=0.0), DataError, "fade")
 
 
