@@ -61,4 +61,5 @@ def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
     (1.0, None, [0, 0, 0]),
 ])  # fmt: skip
 def test_what_is_none_is_refused(arguments):
-    refused(lambda: ViaPoint(*arguments), DataError)
+    with pytest.raises(DataError):
+        ViaPoint(*arguments)
