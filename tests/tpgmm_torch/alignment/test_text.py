@@ -2,8 +2,7 @@
 
 from typing import get_args
 
-import pytest
-
+from tests.support.refusals import refused
 from tpgmm_tools.arguments.options import Alignments
 from tpgmm_torch.alignment.text import METHODS, parse_alignment
 from tpgmm_torch.exceptions import DataError
@@ -19,8 +18,7 @@ def test_names_stand_for_alignments():
         "none": "None",
     }
     assert parse_alignment("events+dtw", features=["speed"]).within.features == ["speed"]
-    with pytest.raises(DataError, match=r"one of \['dtw', .*got 'warp'"):
-        parse_alignment("warp")
+    refused(lambda: parse_alignment("warp"), DataError, r"one of \['dtw', .*got 'warp'")
 
 
 def test_the_command_line_has_them_all():
