@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +61,6 @@ def describe_policy(policy: str) -> str:
     return f"{variant.base} with {', '.join(f'`{item}`' for item in variant.overrides)}"
 
 
-def by_policy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Iterate over the rows of each policy, in the order of the report."""
-    for policy in order_policies(rows.policy):
-        yield policy, rows[rows.policy == policy]
-
-
 def write_page(path: Path, text: str) -> Path:
     """Write a text in one step; return the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,9 +75,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
 
 
-def rate(rows: pd.DataFrame) -> str:
-    """Format the successes of episodes; a dash where there are none."""
-    return rate_of(int(rows.success.sum()), len(rows)) if len(rows) else "-"
+def rate(successes: pd.Series[bool]) -> str:
+    """Format the share of successes."""
+    return rate_of(int(successes.sum()), len(successes))
 
 
 def rate_of(successes: int, trials: int) -> str:
@@ -130,8 +124,8 @@ def cost_table(cells: pd.DataFrame) -> str:
         per_episode=cells.evaluation_cpu_seconds / cells.episodes, megabytes=cells.bytes / 1e6
     )
     rows = [
-        [policy, *(_range(part[key], digits) for key, digits in COSTS.values())]
-        for policy, part in by_policy(cells)
+        [policy, *(_range(cells[key][cells.policy == policy], n) for key, n in COSTS.values())]
+        for policy in order_policies(cells.policy)
     ]
     return table(["policy", *COSTS], rows)
 
