@@ -19,7 +19,7 @@ import typer
 
 from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from lerobot_env_bimanual.metaworld.tasks import TASKS, check_task
-from tpgmm_evaluation.cells import Cell, Results, parse_numbers
+from tpgmm_evaluation.cells import Cell, Job, Results, parse_numbers, run_cells
 from tpgmm_evaluation.metaworld.learners import LEARNERS, Actor, Learner, settings_of
 from tpgmm_evaluation.metaworld.networks import Network
 from tpgmm_evaluation.metaworld.recordings import (
@@ -58,6 +58,7 @@ def run(
     record: int = 12,
     budget: float = Network.budget / 60,
     tuning: bool = False,
+    workers: int = 1,
     out: Path = Path("out/metaworld"),
 ) -> None:
     """Record experts, learn from them, and try what was learned in unseen situations.
@@ -80,34 +81,32 @@ def run(
         Minutes of the processor for each network at most.
     tuning : bool
         Try in other situations than those that are reported.
+    workers : int >= 1
+        Processes, of one thread each.
     out : ``DIR``
         Where results are.
     """
-    torch.set_num_threads(1)
     names = TASKS if tasks == "all" else [check_task(name) for name in tasks.split(",")]
     learners = _choose_learners(policies.split(","), 60 * budget)
     results = Results(out / ("tuning" if tuning else "cells"))
     situations = evaluation_seeds(episodes, tuning=tuning)
     counts = parse_numbers(demonstrations, "--demonstrations")
-    grid = list(product(parse_numbers(seeds, "--seeds"), counts))
+    grid = list(product(parse_numbers(seeds, "--seeds"), counts, learners))
+    jobs = []
     for task in names:
-        missing = {}
-        for (seed, n), policy in product(grid, learners):
-            cell = Cell(task, policy, n, seed)
-            done = _read_episodes(results, cell, settings_of(learners[policy]), situations)
-            if len(done) < episodes:
-                missing[cell] = done
-        if not missing:
-            continue
-        env = MetaworldStateEnv(task)
-        for cell, done in missing.items():
-            learner, folder = learners[cell.policy], out / "demonstrations"
-            result = _measure(env, cell, learner, folder, record, situations, done)
-            results.write(cell, result)
-            solved = sum(episode["success"] for episode in result["episodes"])
-            typer.echo(f"{cell.key}: {solved} of {episodes}")
-        env.close()
+        cells = [
+            cell
+            for cell in (Cell(task, policy, n, seed) for seed, n, policy in grid)
+            if len(_read_episodes(results, cell, learners[cell.policy], situations)) < episodes
+        ]
+        if cells:
+            arguments = cells, learners, results, situations, record
+            jobs.append(Job(cells, results, arguments))
+    failures = run_cells(measure_cells, jobs, workers, typer.echo)
     report(results, out)
+    if failures:
+        typer.echo(f"{len(failures)} cells failed", err=True)
+        raise typer.Exit(1)
 
 
 def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
@@ -124,48 +123,66 @@ def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
 
 
 def _read_episodes(
-    results: Results, cell: Cell, settings: dict[str, Any], situations: Sequence[int]
+    results: Results, cell: Cell, learner: Learner, situations: Sequence[int]
 ) -> list[dict[str, Any]]:
     """Read episodes of a cell in the first of these situations, of the same settings."""
     found = results.read(cell)
-    if found is None or found["settings"] != settings:
+    if found is None or found["settings"] != settings_of(learner):
         return []
     seeds = [episode["seed"] for episode in found["episodes"]]
     same = seeds[: len(situations)] == [*situations][: len(seeds)]
     return list(found["episodes"]) if same else []
 
 
-def _measure(
-    env: MetaworldStateEnv,
-    cell: Cell,
-    learner: Learner,
-    folder: Path,
-    record: int,
+def measure_cells(
+    cells: Sequence[Cell],
+    learners: dict[str, Learner],
+    results: Results,
     situations: Sequence[int],
-    done: list[dict[str, Any]],
-) -> dict[str, Any]:
-    shown = record_expert(folder, cell.env, cell.seed, cell.demonstrations, record)
-    chosen = successes(shown, cell.demonstrations, cell.env)
-    held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
-    began = time.process_time()
-    actor: Actor = (
-        learner.fit(chosen, cell.seed, held_out)
-        if isinstance(learner, Network)
-        else learner.fit(chosen, cell.seed)
-    )
-    trained = time.process_time()
-    episodes = [*done, *try_out(env, actor, situations[len(done) :])]
-    return {
-        "episodes": episodes,
-        "settings": settings_of(learner),
-        "expert": {"episodes": len(shown), "successes": sum(e.success for e in shown)},
-        "demonstration_seeds": [episode.seed for episode in chosen],
-        "validation_seeds": [episode.seed for episode in held_out],
-        "training_seconds": trained - began,  # of the processor
-        "training_outcome": actor.outcome,
-        "evaluation_seconds": time.process_time() - trained,
-        "versions": {name: version(name) for name in PACKAGES},
-    }
+    record: int,
+) -> None:
+    """Learn a task, and try what was learned in the situations that are missing.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Of one task.
+    learners : dict
+        By the names of policies.
+    results : Results
+        Beside whose folder demonstrations are kept.
+    situations : sequence of int
+        Seeds of the episodes.
+    record : int
+        Episodes of the expert at least.
+    """
+    torch.set_num_threads(1)
+    env, folder = MetaworldStateEnv(cells[0].env), results.folder.parent / "demonstrations"
+    for cell in cells:
+        learner = learners[cell.policy]
+        done = _read_episodes(results, cell, learner, situations)
+        shown = record_expert(folder, cell.env, cell.seed, cell.demonstrations, record)
+        chosen = successes(shown, cell.demonstrations, cell.env)
+        held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
+        began = time.process_time()
+        actor: Actor = learner.fit(chosen, cell.seed, held_out)
+        trained = time.process_time()
+        episodes = [*done, *try_out(env, actor, situations[len(done) :])]
+        results.write(
+            cell,
+            {
+                "episodes": episodes,
+                "settings": settings_of(learner),
+                "expert": {"episodes": len(shown), "successes": sum(e.success for e in shown)},
+                "demonstration_seeds": [episode.seed for episode in chosen],
+                "validation_seeds": [episode.seed for episode in held_out],
+                "training_seconds": trained - began,  # of the processor
+                "training_outcome": actor.outcome,
+                "evaluation_seconds": time.process_time() - trained,
+                "versions": {name: version(name) for name in PACKAGES},
+            },
+        )
+    env.close()
 
 
 def report(results: Results, out: Path) -> None:

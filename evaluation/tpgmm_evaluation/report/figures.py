@@ -142,7 +142,7 @@ def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]
     rows = math.ceil(len(tasks) / columns)
     size = (max(4.2, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
     figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    grid = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
     for axes in grid[len(tasks) :]:
         axes.remove()
     grid = grid[: len(tasks)]
