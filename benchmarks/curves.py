@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks import mixtures
-from benchmarks.batched_step import tick
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
 from benchmarks.skill import fit_model
+from benchmarks.steps import tick
 from benchmarks.timing import in_turns, medians, per_call, per_iteration
 
 __all__ = ["measure"]
