@@ -99,7 +99,7 @@ def write_summary(
         s=summary,
         failures=failures,
         commands=_keep_command(out / "commands.txt", command),
-        describe_policy=pages.describe_policy,
+        describe_variant=pages.describe_variant,
         share=pages.share,
         rate_of=pages.rate_of,
         reference=REFERENCE,
