@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, product
+from itertools import chain, groupby, product
 from pathlib import Path
 
 from lerobot_env_bimanual.disturbances import NOMINAL
@@ -156,30 +156,18 @@ def choose_conditions(
     UnknownNameError
         If none of them knows one.
     """
-    every = [task.benchmark().all_conditions for task in tasks]  # an unknown task ends here
-    for name in dict.fromkeys(conditions):
-        unknown = [t.env for t in tasks if name != ALL_CONDITIONS and not t.knows(name)]
+    chosen = []
+    for task in tasks:
+        every = task.benchmark().all_conditions  # an unknown task ends here
+        names = chain.from_iterable(every if n == ALL_CONDITIONS else [n] for n in conditions)
+        chosen.append([name for name in dict.fromkeys(names) if task.knows(name)])
+    for name in dict.fromkeys(name for name in conditions if name != ALL_CONDITIONS):
+        unknown = [t.env for t, names in zip(tasks, chosen, strict=True) if name not in names]
         if len(unknown) == len(tasks):
             tasks[0].disturb(name)  # says what it knows
         if unknown:
             say(f"{', '.join(unknown)}: not tried in {name!r}, which is unknown there")
-    return [
-        _expand_conditions(task, conditions, names)
-        for task, names in zip(tasks, every, strict=True)
-    ]
-
-
-def _expand_conditions(
-    task: Settings, conditions: Sequence[str], every: Sequence[str]
-) -> list[str]:
-    """List the conditions that an environment knows, each once."""
-    chosen: list[str] = []
-    for name in conditions:
-        if name == ALL_CONDITIONS:
-            chosen += every
-        elif task.knows(name):
-            chosen.append(name)
-    return list(dict.fromkeys(chosen))
+    return chosen
 
 
 def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:

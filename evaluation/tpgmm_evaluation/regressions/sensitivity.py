@@ -8,14 +8,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tpgmm_evaluation.regressions.comparison import Array, compare_cells, read_pairs
+from tpgmm_evaluation.regressions.comparison import compare_cells, read_pairs
 from tpgmm_evaluation.regressions.plan import Plan, import_paths
 from tpgmm_torch.exceptions import DataError
 
@@ -88,36 +88,19 @@ def _measure(out: Path, plan: Plan, sections: Sequence[str], copy: str = "") -> 
 def _change(usual: Path, other: Path, sections: Sequence[str]) -> str:
     """Describe how quantities changed."""
     pairs = list(read_pairs(usual / "baseline-small", other / "baseline-small", sections))
-    changes: dict[str, list[float]] = {"same": [0.0], "error": [], "score": [], "success": []}
+    moves, changes = [0.0], dict[str, list[float]]()
     for _, before, now in pairs:
         for key in set(before) & set(now):
-            kind = key.partition(":")[0]
-            if kind in CHANGES:
-                changes[kind] += CHANGES[kind](key, before[key], now[key])
+            (kind, _, name), old, new = key.partition(":"), before[key], now[key]
+            if kind == "same" and "references" in name and old.shape == new.shape:
+                moves.append(float(np.abs(old - new).max()))
+            elif kind == "error" and old.mean() > 0:
+                changes.setdefault(kind, []).append(float(100 * (new.mean() / old.mean() - 1)))
+            elif kind in ("score", "success"):
+                changes.setdefault(kind, []).append(float((new - old).mean()))
     worse = sum(bool(row.worse) and row.now != row.before for row in compare_cells(pairs))
-    means = {kind: np.mean(values) for kind, values in changes.items() if values}
     texts = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
-    parts = [texts[kind].format(mean) for kind, mean in means.items() if kind in texts]
-    return ", ".join([f"references up to {max(changes['same']):.2g}", *parts, f"{worse} worse"])
-
-
-def _move_of_references(key: str, before: Array, now: Array) -> list[float]:
-    same = "references" in key and before.shape == now.shape
-    return [float(np.abs(before - now).max())] if same else []
-
-
-def _growth(key: str, before: Array, now: Array) -> list[float]:
-    return [float(100 * (now.mean() / before.mean() - 1))] if before.mean() > 0 else []
-
-
-def _mean_change(key: str, before: Array, now: Array) -> list[float]:
-    return [float((now - before).mean())]
-
-
-#: How much a quantity changed, by its kind; nothing where that says nothing.
-CHANGES: Mapping[str, Callable[[str, Array, Array], list[float]]] = {
-    "same": _move_of_references,
-    "error": _growth,
-    "score": _mean_change,
-    "success": _mean_change,
-}
+    parts = [
+        text.format(np.mean(changes[kind])) for kind, text in texts.items() if kind in changes
+    ]
+    return ", ".join([f"references up to {max(moves):.2g}", *parts, f"{worse} worse"])
