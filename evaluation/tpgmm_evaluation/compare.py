@@ -106,16 +106,20 @@ def compare(
         for seed in sorted({cell.seed for cell in left}):
             say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
             record(folder, task, max(demonstrations), seed)
-        ordered = sorted(left, key=lambda cell: cell.training)  # stable
-        for _, same in groupby(ordered, key=lambda cell: cell.training):
-            chosen = list(same)
-            jobs.append(Job(chosen, Results(folder / "cells"), (folder, task, chosen)))
+        jobs += _by_training(folder, task, left)
     # networks first, which take long, so that no worker is idle at the end
     jobs.sort(key=lambda job: job.cells[0].variant.base not in RECIPES)
     failures = run_cells(run, jobs, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
     return Comparison(total - len(failures), failures)
+
+
+def _by_training(folder: Path, task: Settings, cells: Sequence[Cell]) -> list[Job]:
+    """Group cells by their training, whose cells run one after the other."""
+    ordered = sorted(cells, key=lambda cell: cell.training)  # stable
+    groups = [list(same) for _, same in groupby(ordered, key=lambda cell: cell.training)]
+    return [Job(same, Results(folder / "cells"), (folder, task, same)) for same in groups]
 
 
 def _check(
@@ -156,11 +160,7 @@ def choose_conditions(
     UnknownNameError
         If none of them knows one.
     """
-    chosen = []
-    for task in tasks:
-        every = task.benchmark().all_conditions  # an unknown task ends here
-        names = chain.from_iterable(every if n == ALL_CONDITIONS else [n] for n in conditions)
-        chosen.append([name for name in dict.fromkeys(names) if task.knows(name)])
+    chosen = [_known_conditions(task, conditions) for task in tasks]
     for name in dict.fromkeys(name for name in conditions if name != ALL_CONDITIONS):
         unknown = [t.env for t, names in zip(tasks, chosen, strict=True) if name not in names]
         if len(unknown) == len(tasks):
@@ -168,6 +168,13 @@ def choose_conditions(
         if unknown:
             say(f"{', '.join(unknown)}: not tried in {name!r}, which is unknown there")
     return chosen
+
+
+def _known_conditions(task: Settings, conditions: Sequence[str]) -> list[str]:
+    """List the conditions that an environment knows, each once."""
+    every = task.benchmark().all_conditions  # an unknown task ends here
+    names = chain.from_iterable(every if n == ALL_CONDITIONS else [n] for n in conditions)
+    return [name for name in dict.fromkeys(names) if task.knows(name)]
 
 
 def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:

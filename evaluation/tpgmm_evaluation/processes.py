@@ -64,6 +64,23 @@ def run_jobs(
             process.terminate()
 
 
+def call_all(
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], workers: int
+) -> list[Any]:
+    """Call a function for each job; return the values in the order of the jobs.
+
+    Raises
+    ------
+    RuntimeError
+        If one fails; with its traceback.
+    """
+    values = {}
+    for number, values[number], problem in run_jobs(function, jobs, workers):
+        if problem:
+            raise RuntimeError(problem)
+    return [values[number] for number in range(len(jobs))]
+
+
 def _call(function: Callable[..., Any], job: tuple[Any, ...], answer: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from itertools import batched
+from itertools import batched, chain
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
 from tpgmm_evaluation.faults.runs import Log, Tick, simulate
-from tpgmm_evaluation.processes import run_jobs
+from tpgmm_evaluation.processes import call_all
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,13 +31,10 @@ def measure_runs(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measu
         groups[run.robot, run.rate].append(run)
     parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
     if workers == 1:
-        return [found for part in parts for found in _measure_part(part)]
-    found = {}
-    for number, measured, problem in run_jobs(_measure_part, [(p,) for p in parts], workers):
-        if problem:
-            raise RuntimeError(problem)
-        found[number] = measured
-    return [each for number in range(len(parts)) for each in found[number]]
+        found = [_measure_part(part) for part in parts]
+    else:
+        found = call_all(_measure_part, [(part,) for part in parts], workers)
+    return list(chain.from_iterable(found))
 
 
 def _measure_part(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:

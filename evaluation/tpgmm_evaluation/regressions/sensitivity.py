@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_evaluation.regressions.comparison import compare_cells, read_pairs
+from tpgmm_evaluation.regressions.comparison import Array, compare_cells, read_pairs
 from tpgmm_evaluation.regressions.plan import Plan, import_paths
 from tpgmm_torch.exceptions import DataError
 
@@ -88,19 +88,22 @@ def _measure(out: Path, plan: Plan, sections: Sequence[str], copy: str = "") -> 
 def _change(usual: Path, other: Path, sections: Sequence[str]) -> str:
     """Describe how quantities changed."""
     pairs = list(read_pairs(usual / "baseline-small", other / "baseline-small", sections))
-    moves, changes = [0.0], dict[str, list[float]]()
+    changes: dict[str, list[float]] = {"same": [0.0], "error": [], "score": [], "success": []}
     for _, before, now in pairs:
         for key in set(before) & set(now):
-            (kind, _, name), old, new = key.partition(":"), before[key], now[key]
-            if kind == "same" and "references" in name and old.shape == new.shape:
-                moves.append(float(np.abs(old - new).max()))
-            elif kind == "error" and old.mean() > 0:
-                changes.setdefault(kind, []).append(float(100 * (new.mean() / old.mean() - 1)))
-            elif kind in ("score", "success"):
-                changes.setdefault(kind, []).append(float((new - old).mean()))
+            kind, _, name = key.partition(":")
+            changes.get(kind, []).extend(_change_of(kind, name, before[key], now[key]))
     worse = sum(bool(row.worse) and row.now != row.before for row in compare_cells(pairs))
     texts = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
-    parts = [
-        text.format(np.mean(changes[kind])) for kind, text in texts.items() if kind in changes
-    ]
-    return ", ".join([f"references up to {max(moves):.2g}", *parts, f"{worse} worse"])
+    parts = [text.format(np.mean(changes[k])) for k, text in texts.items() if changes[k]]
+    return ", ".join([f"references up to {max(changes['same']):.2g}", *parts, f"{worse} worse"])
+
+
+def _change_of(kind: str, name: str, before: Array, now: Array) -> list[float]:
+    """Compute how much a quantity changed, by its kind; nothing where that says nothing."""
+    if kind == "same":
+        same = "references" in name and before.shape == now.shape
+        return [float(np.abs(before - now).max())] if same else []
+    if kind == "error":
+        return [float(100 * (now.mean() / before.mean() - 1))] if before.mean() > 0 else []
+    return [float((now - before).mean())]
