@@ -75,9 +75,10 @@ def call_all(
         If one fails; with its traceback.
     """
     values = {}
-    for number, values[number], problem in run_jobs(function, jobs, workers):
+    for number, value, problem in run_jobs(function, jobs, workers):
         if problem:
             raise RuntimeError(problem)
+        values[number] = value
     return [values[number] for number in range(len(jobs))]
 
 
