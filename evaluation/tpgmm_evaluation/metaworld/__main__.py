@@ -6,28 +6,18 @@ one with more episodes adds those that are new.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import Any
 
-import torch
 import typer
 
-from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from lerobot_env_bimanual.metaworld.tasks import TASKS, check_task
 from tpgmm_evaluation.cells import Cell, Job, Results, parse_numbers, run_cells
-from tpgmm_evaluation.metaworld.learners import LEARNERS, Actor, Learner, settings_of
+from tpgmm_evaluation.metaworld.learners import LEARNERS, Learner
 from tpgmm_evaluation.metaworld.networks import Network
-from tpgmm_evaluation.metaworld.recordings import (
-    evaluation_seeds,
-    record_expert,
-    successes,
-    validation,
-)
+from tpgmm_evaluation.metaworld.recordings import evaluation_seeds
 from tpgmm_evaluation.metaworld.summary import (
     comparison_table,
     cost_table,
@@ -35,16 +25,13 @@ from tpgmm_evaluation.metaworld.summary import (
     summary,
     task_table,
 )
-from tpgmm_evaluation.metaworld.trials import try_out
+from tpgmm_evaluation.metaworld.trials import measure_cells, read_episodes
 from tpgmm_evaluation.report.pages import write_page
 from tpgmm_evaluation.report.tables import episode_table, write_table
 from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import UnknownNameError
 
 app = typer.Typer(add_completion=False)
-
-#: Whose versions are written down with each cell.
-PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot", "diffusers")
 
 
 @options.command(app, "python -m tpgmm_evaluation.metaworld --tasks reach-v3 --seeds 0,1")
@@ -97,7 +84,7 @@ def run(
         cells = [
             cell
             for cell in (Cell(task, policy, n, seed) for seed, n, policy in grid)
-            if len(_read_episodes(results, cell, learners[cell.policy], situations)) < episodes
+            if len(read_episodes(results, cell, learners[cell.policy], situations)) < episodes
         ]
         if cells:
             arguments = cells, learners, results, situations, record
@@ -120,69 +107,6 @@ def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
             learner = replace(learner, budget=budget)
         learners[name] = learner
     return learners
-
-
-def _read_episodes(
-    results: Results, cell: Cell, learner: Learner, situations: Sequence[int]
-) -> list[dict[str, Any]]:
-    """Read episodes of a cell in the first of these situations, of the same settings."""
-    found = results.read(cell)
-    if found is None or found["settings"] != settings_of(learner):
-        return []
-    seeds = [episode["seed"] for episode in found["episodes"]]
-    same = seeds[: len(situations)] == [*situations][: len(seeds)]
-    return list(found["episodes"]) if same else []
-
-
-def measure_cells(
-    cells: Sequence[Cell],
-    learners: dict[str, Learner],
-    results: Results,
-    situations: Sequence[int],
-    record: int,
-) -> None:
-    """Learn a task, and try what was learned in the situations that are missing.
-
-    Parameters
-    ----------
-    cells : sequence of Cell
-        Of one task.
-    learners : dict
-        By the names of policies.
-    results : Results
-        Beside whose folder demonstrations are kept.
-    situations : sequence of int
-        Seeds of the episodes.
-    record : int
-        Episodes of the expert at least.
-    """
-    torch.set_num_threads(1)
-    env, folder = MetaworldStateEnv(cells[0].env), results.folder.parent / "demonstrations"
-    for cell in cells:
-        learner = learners[cell.policy]
-        done = _read_episodes(results, cell, learner, situations)
-        shown = record_expert(folder, cell.env, cell.seed, cell.demonstrations, record)
-        chosen = successes(shown, cell.demonstrations, cell.env)
-        held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
-        began = time.process_time()
-        actor: Actor = learner.fit(chosen, cell.seed, held_out)
-        trained = time.process_time()
-        episodes = [*done, *try_out(env, actor, situations[len(done) :])]
-        results.write(
-            cell,
-            {
-                "episodes": episodes,
-                "settings": settings_of(learner),
-                "expert": {"episodes": len(shown), "successes": sum(e.success for e in shown)},
-                "demonstration_seeds": [episode.seed for episode in chosen],
-                "validation_seeds": [episode.seed for episode in held_out],
-                "training_seconds": trained - began,  # of the processor
-                "training_outcome": actor.outcome,
-                "evaluation_seconds": time.process_time() - trained,
-                "versions": {name: version(name) for name in PACKAGES},
-            },
-        )
-    env.close()
 
 
 def report(results: Results, out: Path) -> None:
