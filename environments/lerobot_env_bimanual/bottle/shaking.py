@@ -126,9 +126,7 @@ class BottleShakingEnv(BottleEnv):
         return successful(figures)
 
     def _draw(self, options: Mapping[str, Any]) -> Start:
-        start = draw_start(self.np_random, skill()).given(options, skill().robot)
-        self._scene.reset(start.poses["bottle"], start.joints, start.mass)
-        return start
+        return draw_start(self.np_random, skill()).given(options, skill().robot)
 
     def _nominal(self) -> Demonstration:
         return _path(tuple(self._start.joints), tuple(self._standing()))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.disturbances import Course, displace_pose
+from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.eyes.views import around
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
@@ -196,9 +196,5 @@ class BiSo101Env(ControlledEnv):
     def _act(self, stopped: bool) -> None:
         self._scene.grip()
 
-    def _usual(self, step: Array) -> bool:
-        return CUP_BOX.contains(displace_pose(self._start.poses["cup"], step))
-
-    def _displace(self, step: Array) -> None:
-        if RIGHT not in self._scene.taken:
-            self._scene.put("cup", displace_pose(self._start.poses["cup"], step))
+    def _stands_usually(self, pose: Array) -> bool:
+        return CUP_BOX.contains(pose)

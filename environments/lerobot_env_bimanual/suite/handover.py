@@ -15,9 +15,15 @@ import numpy as np
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -131,11 +137,11 @@ class _Judge(Judge):
         self.lifted = self.put = False
         self.opening = Closing(reach=PUT)
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         self.time += seconds
         self.lifted |= RIGHT in scene.held and height(scene) > LIFTED
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
         if LEFT in scene.held and RIGHT in scene.held:
             return (LEFT,)
         near = self.lifted and RIGHT in scene.held
@@ -144,7 +150,7 @@ class _Judge(Judge):
             return (RIGHT,)
         return ()
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             **on_stand(scene),
             "passed": float(LEFT in scene.taken and RIGHT in scene.taken),
@@ -152,7 +158,7 @@ class _Judge(Judge):
         }
 
 
-def on_stand(scene: SuiteScene) -> dict[str, float]:
+def on_stand(scene: RobotScene) -> dict[str, float]:
     """Measure how far the baton is from its place [mm], and how it leans [deg]."""
     baton, stand = scene.pose("baton"), scene.pose("stand")
     away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
@@ -162,6 +168,6 @@ def on_stand(scene: SuiteScene) -> dict[str, float]:
     }
 
 
-def height(scene: SuiteScene) -> float:
+def height(scene: RobotScene) -> float:
     """Return the height of the baton's foot above the table [m]."""
     return float(scene.pose("baton")[2] - FOOT - scene.table)

@@ -19,9 +19,8 @@ from torch import Tensor
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
-from lerobot_env_bimanual.robot_scene import TABLE, add_geom
+from lerobot_env_bimanual.robot_scene import TABLE, Hold, RobotScene, add_geom, add_thing
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -171,7 +170,7 @@ class _Judge(Judge):
         self.box: Pose | None = None
         self.shutting = Closing(reach=math.radians(SHUT))
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         self.time += seconds
         angle, place = self._angle(scene), scene.pose("box")[:3]
         if self.box is None or not scene.taken:
@@ -183,14 +182,14 @@ class _Judge(Judge):
         self.pull = max([self.pull, *map(scene.pull, scene.held)])
         self.lost |= not self.released and scene.held != scene.taken
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
         if self.released or self.kept < KEPT:
             return ()
         gap = math.radians(max(self._angle(scene), 0.0))
         self.released = self.shutting.update(self.time, gap)
         return tuple(scene.held) if self.released else ()
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "opened_deg": self.opened,
             "kept_s": self.kept,
@@ -200,6 +199,6 @@ class _Judge(Judge):
             "pull_n": self.pull,
         }
 
-    def _angle(self, scene: SuiteScene) -> float:
+    def _angle(self, scene: RobotScene) -> float:
         """By how much the lid is open [deg]."""
         return math.degrees(float(scene.data.joint("lid").qpos[0]))

@@ -20,9 +20,16 @@ from torch import Tensor
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    OBJECT,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -167,13 +174,13 @@ class _Judge(Judge):
     def __init__(self) -> None:
         self.force = self.inserted = 0.0
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         pressed = np.linalg.norm(scene.force("block", "peg"))
         self.force = max(self.force, float(pressed))
         deep = _depth(scene) >= DEEP and {PEG, BLOCK} <= scene.held
         self.inserted = self.inserted + seconds if deep else 0.0
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "depth_mm": 1e3 * _depth(scene),
             "inserted_s": self.inserted,
@@ -182,7 +189,7 @@ class _Judge(Judge):
         }
 
 
-def _depth(scene: SuiteScene) -> float:
+def _depth(scene: RobotScene) -> float:
     """Measure how deep the middle of the peg's end is in the hole, 0 beside it [m]."""
     peg, block = (scene.data.body(name) for name in ("peg", "block"))
     tip = peg.xpos - LENGTH * peg.xmat.reshape(3, 3)[:, 2]

@@ -21,9 +21,15 @@ from torch import Tensor
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -197,7 +203,7 @@ class _Judge(Judge):
         self.places: Array = np.zeros((0, 3))
         self.speeds: Array = np.zeros((0, 3))
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         before = _seen(scene, self.places)
         self.places = self.places + self.speeds * seconds
         self.places[:, 2] -= GRAVITY * seconds**2 / 2
@@ -220,7 +226,7 @@ class _Judge(Judge):
         self.amounts, self.places = self.amounts[~down], self.places[~down]
         self.speeds = self.speeds[~down]
 
-    def _flow(self, scene: SuiteScene, seconds: float) -> None:
+    def _flow(self, scene: RobotScene, seconds: float) -> None:
         """Let more leave the jug, where its rim is lowest."""
         axis = scene.data.body("jug").xmat.reshape(3, 3)[:, 2]
         down = axis[2] * axis - (0.0, 0.0, 1.0)
@@ -235,7 +241,7 @@ class _Judge(Judge):
             self.speeds = np.concatenate((self.speeds, speed[None]))
         self.mouth = mouth
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "poured": self.poured,
             "spilled": self.spilled,
@@ -245,13 +251,13 @@ class _Judge(Judge):
         }
 
 
-def _seen(scene: SuiteScene, places: Array) -> Array:
+def _seen(scene: RobotScene, places: Array) -> Array:
     """Places (n, 3) as seen from the cup [m]."""
     cup = scene.data.body("cup")
     return np.asarray((places - cup.xpos) @ cup.xmat.reshape(3, 3))
 
 
-def _lean(scene: SuiteScene, name: str) -> float:
+def _lean(scene: RobotScene, name: str) -> float:
     """Return the angle of an object's axis with the vertical [deg]."""
     cosine = float(scene.data.body(name).xmat[8])
     return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

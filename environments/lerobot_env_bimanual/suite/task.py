@@ -22,8 +22,8 @@ from torch import Tensor
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import Carrier
+from lerobot_env_bimanual.robot_scene import Hold, RobotScene
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands, place_hand
 from tpgmm_torch import (
@@ -126,7 +126,7 @@ class Judge(ABC):
     """
 
     @abstractmethod
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         """Look at the world after a tick in which the robot was not stopped.
 
         Parameters
@@ -135,12 +135,12 @@ class Judge(ABC):
             How long it took.
         """
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
         """Choose the hands that open now."""
         return ()
 
     @abstractmethod
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         """Measure how well it goes, so far."""
 
 

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import flat_at
-from lerobot_env_bimanual.robot_scene import BOX, PALM, add_geom
+from lerobot_env_bimanual.robot_scene import BOX, PALM, Hold, RobotScene, add_geom, add_thing
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -198,7 +197,7 @@ class _Judge(Judge):
         self.wiped = np.zeros(shape, dtype=bool)
         self.pressed = self.impulse = self.edge = self.off = self.pause = 0.0
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         force = scene.touch("sponge", "board")
         low, high = FORCES
         if force < low:
@@ -212,7 +211,7 @@ class _Judge(Judge):
         if force <= high:
             self._wipe(scene)
 
-    def _wipe(self, scene: SuiteScene) -> None:
+    def _wipe(self, scene: RobotScene) -> None:
         """Mark the cells that are in the sponge, which gives way to the board."""
         rows, columns = (
             (np.arange(n) + 0.5) * CELL - half
@@ -224,7 +223,7 @@ class _Judge(Judge):
         inside = np.abs((cells - sponge.xpos) @ sponge.xmat.reshape(3, 3)) <= SPONGE
         self.wiped |= inside.all(-1)
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "coverage": float(self.wiped.mean()),
             "force": self.impulse / self.pressed if self.pressed else 0.0,
