@@ -178,6 +178,11 @@ class ControlledEnv(StateEnv):
         self._live = asked.track or any(part.live for part in self.disturbances)
         self._steps = steps  # no episode is going on
 
+    @property
+    def scene(self) -> RobotScene:
+        """The simulated world."""
+        return self._scene
+
     def rig(
         self, cameras: str | Sequence[str], size: tuple[int, int] = (640, 480), **options: Any
     ) -> Rig:
