@@ -72,6 +72,8 @@ def add_position_control(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpe
         motor.set_to_position(kp=gain * STIFFNESS, kv=gain * DAMPING)
     for body in spec.bodies[1:]:
         body.gravcomp = 1.0  # as the controllers of such robots do
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
     for hand in HANDS:
         palm = spec.body(hand).geoms[0]
         palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", PALM, (0.85, 0.45, 0.2, 1)

@@ -127,13 +127,9 @@ class AlohaStateEnv(StateEnv):
         self.yaw_range, self.track, self.stop_at_success = yaw_range, track, stop_at_success
         self._substeps = rate // fps
         self.action_space = _actions(self._physics.model)
+        sizes = {"agent_pos": len(JOINTS), "environment_state": 7 * len(OBJECTS[task])}
         self.observation_space = gym.spaces.Dict(
-            {
-                "agent_pos": gym.spaces.Box(-1000, 1000, (len(JOINTS),), np.float64),
-                "environment_state": gym.spaces.Box(
-                    -1000, 1000, (7 * len(OBJECTS[task]),), np.float64
-                ),
-            }
+            {k: gym.spaces.Box(-1000, 1000, (n,), np.float64) for k, n in sizes.items()}
         )
 
     def reset(

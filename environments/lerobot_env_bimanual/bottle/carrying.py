@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import SLIDE, TASK, CarryAndPut, slide
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
@@ -20,7 +19,7 @@ from lerobot_env_bimanual.bottle.scene import CARRIERS, TrayScene
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.skill import FOOT
-from tpgmm_torch import Demonstration, Frame, Situation
+from tpgmm_torch import Frame
 
 __all__ = ["CarryAndPutEnv"]
 
@@ -33,8 +32,6 @@ LIFTED = 0.02
 PUT = 0.01
 #: A bottle that leans more than this does not stand [deg].
 UPRIGHT = 5.0
-#: Time steps per second of the path on which a robot is put [1/s].
-PATH_RATE = 25.0
 
 
 @functools.cache
@@ -163,25 +160,8 @@ class CarryAndPutEnv(BottleEnv):
         self._lifted &= self._grasp_step is not None
         self._put &= not self._scene.held and self._lifted
 
-    def _nominal(self) -> Demonstration:
-        start, standing = self._start, self._standing()
-        return _path(*map(tuple, (start.joints, standing, start.poses["tray"], start.slide)))
+    def _generator(self) -> CarryAndPut:
+        return carrying()
 
-    def _stands_usually(self, bottle: Array) -> bool:
-        return carrying().usual(Frame(bottle[:3], bottle[3:]))
-
-
-@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
-def _path(
-    joints: tuple[float, ...],
-    bottle: tuple[float, ...],
-    tray: tuple[float, ...],
-    slide: tuple[float, ...],
-) -> Demonstration:
-    frames = {
-        name: Frame(pose[:3], pose[3:]) for name, pose in (("bottle", bottle), ("tray", tray))
-    }
-    situation = Situation(torch.tensor(joints), frames)
-    generator = CarryAndPut(rate=PATH_RATE, robot=skill().robot)
-    [path] = generator.nominal([situation], np.array([slide]))
-    return path
+    def _slides(self) -> tuple[float, ...]:
+        return tuple(self._start.slide)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,11 +20,13 @@ from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.robot_scene import Hold
 from lerobot_env_bimanual.start import Start
-from tpgmm_datasets.bottle.skill import FOOT
-from tpgmm_torch import Demonstration, Frame
+from tpgmm_datasets.bottle.skill import FOOT, BottleSkill
+from tpgmm_torch import Demonstration, Frame, Situation
 
 #: The grip gives way at this force [N], without dynamics at this displacement [m].
 GRIP_FORCE, GRIP_SLIP = 100.0, 0.03
+#: Time steps per second of the path on which a robot is put [1/s].
+PATH_RATE = 25.0
 
 
 class BottleEnv(ControlledEnv):
@@ -49,11 +53,24 @@ class BottleEnv(ControlledEnv):
         """Draw an episode, and set the scene."""
 
     @abstractmethod
+    def _generator(self) -> BottleSkill:
+        """Return the generator of the demonstrations."""
+
+    def _slides(self) -> tuple[float, ...]:
+        """Return how the bottle slides in the hands [m, rad], if it does."""
+        return ()
+
     def _nominal(self) -> Demonstration:
         """Return the generator's path for this start posture and the objects where they are.
 
         Its event ``"grasp"`` says from when on the hands hold the bottle.
         """
+        poses = {**self._start.poses, "bottle": self._standing()}
+        frames = tuple((name, tuple(pose)) for name, pose in poses.items())
+        return _path(self._generator(), tuple(self._start.joints), frames, self._slides())
+
+    def _stands_usually(self, pose: Array) -> bool:
+        return self._generator().usual(Frame(pose[:3], pose[3:]))
 
     def _begin(self, options: Mapping[str, Any]) -> Start:
         start = self._draw(options)
@@ -155,3 +172,17 @@ def _at(path: Demonstration, instant: float) -> Array:
     """Interpolate the posture at an instant."""
     time, joints = path.time.numpy(), path.joints.numpy()
     return np.array([np.interp(instant, time, column) for column in joints.T])
+
+
+@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
+def _path(
+    generator: Any,
+    joints: tuple[float, ...],
+    poses: tuple[tuple[str, tuple[float, ...]], ...],
+    slides: tuple[float, ...],
+) -> Demonstration:
+    frames = {name: Frame(pose[:3], pose[3:]) for name, pose in poses}
+    options = [np.array([slides])] if slides else []
+    slow = replace(generator, rate=PATH_RATE)
+    [path] = slow.nominal([Situation(torch.tensor(joints), frames)], *options)
+    return path  # type: ignore[no-any-return]

@@ -23,7 +23,6 @@ from lerobot_env_bimanual.robot_scene import (
     add_geom,
     add_thing,
 )
-from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -61,7 +60,6 @@ class Handover(SuiteTask):
 
     name = "handover"
     description = "take the baton with the left hand, pass it to the right, put it on the stand"
-    objects = SUITE["handover"]
     foot = FOOT
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "raise": 0.8, "bring": 2.0, "meet": 1.2,
@@ -131,24 +129,35 @@ class Handover(SuiteTask):
         return [*(seen(*pair, orientation) for pair in (*pairs, last)), Canonical()]
 
 
-class _Judge(Judge):
+class PutDown(Judge):
+    """Opens the hand that has lifted the baton when that is down again."""
+
+    hold: ClassVar[Hold]
+
     def __init__(self) -> None:
         self.time = 0.0
         self.lifted = self.put = False
         self.opening = Closing(reach=PUT)
 
     def note(self, scene: RobotScene, seconds: float) -> None:
+        """Note whether the hand has lifted the baton."""
         self.time += seconds
-        self.lifted |= RIGHT in scene.held and height(scene) > LIFTED
+        self.lifted = self.hold in scene.held and (self.lifted or height(scene) > LIFTED)
 
     def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
-        if LEFT in scene.held and RIGHT in scene.held:
-            return (LEFT,)
-        near = self.lifted and RIGHT in scene.held
-        if near and self.opening.update(self.time, max(height(scene), 0.0)):
+        """Open it when the baton comes no nearer to the table."""
+        if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
             self.put = True
-            return (RIGHT,)
+            return (self.hold,)
         return ()
+
+
+class _Judge(PutDown):
+    hold = RIGHT
+
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
+        both = LEFT in scene.held and RIGHT in scene.held
+        return (LEFT,) if both else super().lets_go(scene)
 
     def figures(self, scene: RobotScene) -> dict[str, float]:
         return {

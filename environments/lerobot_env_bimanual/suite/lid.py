@@ -20,7 +20,6 @@ from lerobot_env_bimanual.bottle.measures import Closing, Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
 from lerobot_env_bimanual.robot_scene import TABLE, Hold, RobotScene, add_geom, add_thing
-from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -30,13 +29,11 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    seen,
     vector,
 )
 from tpgmm_datasets.bottle.skill import place_hand
-from tpgmm_torch import Canonical, Frame, quaternions
+from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
-from tpgmm_torch.operators import Operator
 
 #: Half of the box along x, y and z [m]; its origin is in its middle.
 HALF = (0.05, 0.06, 0.04)
@@ -71,7 +68,6 @@ class Lid(SuiteTask):
 
     name = "lid"
     description = "hold the box with the left hand, open its lid with the right, close it"
-    objects = SUITE["lid"]
     foot = HALF[2]
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "open": 2.5, "keep": 2.0, "shut": 2.5,
@@ -80,6 +76,8 @@ class Lid(SuiteTask):
     carriers: ClassVar = {"box": cube_at(10, HALF[0] + CUBE_ROOM)}
     grasp, box = "close", AREA
     holds = (HELD, LID)
+    # the hands from each other: the closed chain
+    pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
     figures: ClassVar = {
         "opened_deg": Figure("opened [deg]", 1, low=OPEN),
         "kept_s": Figure("kept open [s]", 1, low=KEPT),
@@ -148,11 +146,6 @@ class Lid(SuiteTask):
     def judge(self) -> Judge:
         """Opens both hands when the lid was open for long enough, and is shut again."""
         return _Judge()
-
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """List the hands seen from the box, and from each other, which is the closed chain."""
-        pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
-        return [*(seen(*pair, orientation) for pair in pairs), Canonical()]
 
 
 def _turn_about_x(pose: Frame, angle: Tensor) -> Frame:

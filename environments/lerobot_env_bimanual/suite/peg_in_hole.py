@@ -29,7 +29,6 @@ from lerobot_env_bimanual.robot_scene import (
     add_geom,
     add_thing,
 )
-from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -40,12 +39,10 @@ from lerobot_env_bimanual.suite.task import (
     Style,
     SuiteTask,
     raise_pose,
-    seen,
     shift_pose,
     vector,
 )
-from tpgmm_torch import Canonical, Frame, quaternions
-from tpgmm_torch.operators import Operator
+from tpgmm_torch import Frame, quaternions
 
 #: The peg's radius, half its length, and its head's radius and half length [m].
 RADIUS, LENGTH, HEAD = 0.012, 0.045, (0.022, 0.015)
@@ -81,7 +78,6 @@ class PegInHole(SuiteTask):
 
     name = "peg_in_hole"
     description = "take the peg and the block with a hole, and insert the peg in the air"
-    objects = SUITE["peg_in_hole"]
     foot = LENGTH
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 0.8, "bring": 2.0, "align": 1.2,
@@ -93,6 +89,8 @@ class PegInHole(SuiteTask):
     }
     grasp, box, grip, wait = "close", AREA, GRIP, WAIT
     holds = (PEG, BLOCK)
+    pairs = (("r_hand", "peg"), ("l_hand", "block"))
+    together = ("peg", "block"), ("r_hand", "l_hand")
     figures: ClassVar = {
         "depth_mm": Figure("depth [mm]", 1, low=1e3 * DEEP),
         "inserted_s": Figure("inserted for [s]", 1, low=0.5),
@@ -155,19 +153,6 @@ class PegInHole(SuiteTask):
     def judge(self) -> Judge:
         """Measures how deep the peg is, for how long, and how hard they press on each other."""
         return _Judge()
-
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Hands seen from where peg and block were, the peg from the block; the joints.
-
-        Without what is held, one hand from the other in place of the peg from the block.
-        """
-        together = ("peg", "block") if held else ("r_hand", "l_hand")
-        return [
-            seen("r_hand", "peg", orientation),
-            seen("l_hand", "block", orientation),
-            seen(*together, orientation, held),
-            Canonical(),
-        ]
 
 
 class _Judge(Judge):

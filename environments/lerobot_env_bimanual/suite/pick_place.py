@@ -6,25 +6,22 @@ is hard; the conditions ``slips`` and ``knocked`` spoil the first grasp.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 
-from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.robot_scene import Hold, RobotScene
 from lerobot_env_bimanual.suite.handover import (
     BOX,
     FOOT,
     LEFT,
-    LIFTED,
-    PUT,
     Handover,
-    height,
+    PutDown,
     on_stand,
-)  # fmt: skip
+)
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -95,23 +92,16 @@ class PickPlace(Handover):
         return [*hand, *own, Canonical()]
 
 
-class _Judge(Judge):
+class _Judge(PutDown):
+    hold = LEFT
+
     def __init__(self) -> None:
-        self.time = 0.0
-        self.lifted = self.put = False
+        super().__init__()
         self.first: Pose | None = None
-        self.opening = Closing(reach=PUT)
 
     def note(self, scene: RobotScene, seconds: float) -> None:
         self.first = scene.pose("l_hand") if self.first is None else self.first
-        self.time += seconds
-        self.lifted = LEFT in scene.held and (self.lifted or height(scene) > LIFTED)
-
-    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
-        if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
-            self.put = True
-            return (LEFT,)
-        return ()
+        super().note(scene, seconds)
 
     def figures(self, scene: RobotScene) -> dict[str, float]:
         hand = scene.pose("l_hand")

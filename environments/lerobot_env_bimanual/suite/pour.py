@@ -29,7 +29,6 @@ from lerobot_env_bimanual.robot_scene import (
     add_geom,
     add_thing,
 )
-from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -40,13 +39,11 @@ from lerobot_env_bimanual.suite.task import (
     Style,
     SuiteTask,
     raise_pose,
-    seen,
     vector,
 )
 from tpgmm_datasets.bottle.skill import between
-from tpgmm_torch import Canonical, Frame, quaternions
+from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
-from tpgmm_torch.operators import Operator
 
 #: Of the cup and the jug, whose frames are in their middle: radius, and half the height [m].
 CUP, CUP_HALF = 0.03, 0.03
@@ -85,7 +82,6 @@ class Pour(SuiteTask):
 
     name = "pour"
     description = "take the cup with the right hand, the jug with the left, pour into the cup"
-    objects = SUITE["pour"]
     foot = CUP_HALF
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
@@ -97,6 +93,8 @@ class Pour(SuiteTask):
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
+    pairs = (("r_hand", "cup"), ("l_hand", "jug"))
+    together = ("jug", "cup"), ("l_hand", "r_hand")
     figures: ClassVar = {
         "poured": Figure("poured", 2, low=0.9),
         "spilled": Figure("spilled", 2, high=0.1),
@@ -160,16 +158,6 @@ class Pour(SuiteTask):
     def judge(self) -> Judge:
         """Follows what flows; hands do not open."""
         return _Judge()
-
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Each hand seen from what it takes, the jug seen from the cup; the joints."""
-        together = ("jug", "cup") if held else ("l_hand", "r_hand")
-        return [
-            seen("r_hand", "cup", orientation),
-            seen("l_hand", "jug", orientation),
-            seen(*together, orientation, held),
-            Canonical(),
-        ]
 
 
 def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:

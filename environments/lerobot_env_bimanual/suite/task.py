@@ -23,10 +23,12 @@ from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import Carrier
 from lerobot_env_bimanual.robot_scene import Hold, RobotScene
+from lerobot_env_bimanual.suite.names import UPPER_BODY, tasks_of
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands, place_hand
 from tpgmm_torch import (
+    Canonical,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -156,8 +158,6 @@ class SuiteTask(ABC):
     #: The name, ``--env.task`` of LeRobot, and what data sets call it.
     name: ClassVar[str]
     description: ClassVar[str]
-    #: What is observed, in this order. The first one can be moved by others.
-    objects: ClassVar[tuple[str, ...]]
     #: How high the first object's origin is above the table [m].
     foot: ClassVar[float]
     #: Nominal seconds of each phase.
@@ -176,9 +176,18 @@ class SuiteTask(ABC):
     #: Where palms touch what they take, and where they wait, in its frame [m].
     grip: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     wait: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    #: What is seen from what; and of two things that come together, one from the other, and
+    #: which hand from the other one where held things are left out.
+    pairs: ClassVar[Sequence[tuple[str, str]]] = ()
+    together: ClassVar[tuple[tuple[str, str], tuple[str, str]] | None] = None
 
     def __init__(self, embodiment: Embodiment) -> None:
         self.embodiment = embodiment
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """What is observed, in this order; the first one can be moved by others."""
+        return tasks_of(UPPER_BODY)[self.name]
 
     @property
     def robot(self) -> Robot:
@@ -214,7 +223,6 @@ class SuiteTask(ABC):
     def judge(self) -> Judge:
         """Make the judge of one episode."""
 
-    @abstractmethod
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """List the subspaces in which TP-GMM learns the task.
 
@@ -225,6 +233,11 @@ class SuiteTask(ABC):
         held : bool, default=True
             False leaves out what is carried as a thing of its own.
         """
+        found = [seen(*pair, orientation) for pair in self.pairs]
+        if self.together is not None:
+            things, hands = self.together
+            found.append(seen(*(things if held else hands), orientation, held))
+        return [*found, Canonical()]
 
     @cached_property
     def duration(self) -> float:
