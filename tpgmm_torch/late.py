@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
-__all__ = ["load_late"]
-
 
 def load_late(
     face: dict[str, Any], homes: Mapping[str, Iterable[str]]

@@ -186,7 +186,7 @@ class SuiteTask(ABC):
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """What is observed, in this order; the first one can be moved by others."""
+        """Name what is observed, in this order; the first one can be moved by others."""
         return tasks_of(UPPER_BODY)[self.name]
 
     @property

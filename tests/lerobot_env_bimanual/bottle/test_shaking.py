@@ -21,7 +21,7 @@ from lerobot_env_bimanual.bottle.shaking import (
 )
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.start import PUSHED
-from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
+from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, BottleShaking
 from tpgmm_tools.paper.sinusoid import sinusoid
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
@@ -163,7 +163,9 @@ def test_a_push_moves_an_arm_for_a_moment():
             for env in (calm, pushed):
                 env.step(start["agent_pos"])
             scenes = calm._scene, pushed._scene
-            hands = [scene.data.xpos[scene._hands] for scene in scenes]
+            hands = [
+                np.stack([scene.data.body(hand).xpos for hand in HANDS]) for scene in scenes
+            ]
             apart.append(np.linalg.norm(hands[0] - hands[1], axis=-1).max())
         assert max(apart[:before]) == 0
         assert apart[-1] < 1e-3
