@@ -19,7 +19,7 @@ from lerobot_env_bimanual.bottle.shaking import (
     FREQUENCY,
     BottleShakingEnv,
 )
-from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.controlled import Options
 from lerobot_env_bimanual.start import PUSHED
 from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, BottleShaking
 from tpgmm_tools.paper.sinusoid import sinusoid
@@ -243,7 +243,7 @@ def test_lerobot_makes_fifty_of_them():
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():
     options = {
-        **ControlledEnv.__init__.__kwdefaults__,
+        **vars(Options()),
         **BottleShakingEnv.__init__.__kwdefaults__,
     }
     config = make_env_config("bottle_shaking", frequency=1.0, amplitude=0.1, episode_length=9)
