@@ -115,7 +115,7 @@ def test_pushed_back_it_is_held_as_it_was(moment, held):
     seen, _ = follow(env, path, moment)
     before, now = seen[round((moment - 2) * FPS)], seen[-1]
     np.testing.assert_allclose(now["environment_state"], before["environment_state"], atol=1e-9)
-    assert env._scene.held == held and not env._put
+    assert bool(env._scene.held) == held and not env._put
 
 
 def test_nothing_slides_while_the_robot_is_stopped():

@@ -11,7 +11,7 @@ from lerobot.envs import env_to_policy_features, make_env, make_env_config
 from stable_baselines3.common.env_checker import check_env as check_by_stable_baselines
 
 import lerobot_env_bimanual  # noqa: F401  registers the environment
-from lerobot_env_bimanual.controlled import NOISE_JOINTS, NOISE_POSE, ControlledEnv
+from lerobot_env_bimanual.controlled import NOISE_JOINTS, NOISE_POSE, Options
 from lerobot_env_bimanual.disturbances import (
     CONDITIONS,
     Displaced,
@@ -78,7 +78,7 @@ def test_lerobot_makes_each_task(name, robot):
 
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():
-    options = {"task", "robot", "force", *ControlledEnv.__init__.__kwdefaults__}
+    options = {"task", "robot", "force", *vars(Options())}
     options -= {"mode", "track"}
     config = make_env_config("bimanual", episode_length=9)
     assert set(config.gym_kwargs) == options and config.task == "handover"

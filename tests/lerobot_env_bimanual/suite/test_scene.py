@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from lerobot_env_bimanual.bottle.conditions import skill
-from lerobot_env_bimanual.robot_scene import TABLE, add_table, robot_spec
-from lerobot_env_bimanual.suite.scene import (
+from lerobot_env_bimanual.robot_scene import (
     OBJECT,
+    TABLE,
     Hold,
-    SuiteScene,
+    RobotScene,
+    add_table,
     add_thing,
+    robot_spec,
 )
 
 LEFT = Hold("l_hand", "rod", "rod")
@@ -46,7 +48,7 @@ def made():
             contype=OBJECT,
             conaffinity=OBJECT,
         )
-    return SuiteScene(spec, ("rod", "cube", "shelf"), (LEFT, RIGHT))
+    return RobotScene(spec, ("rod", "cube", "shelf"), (LEFT, RIGHT))
 
 
 def beside(scene, hand="l_hand", off=0.02):
