@@ -5,15 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from lerobot_env_bimanual.suite import pour
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.pour import (
-    BRIM,
-    CUP,
-    CUP_HALF,
-    FLOW,
-    JUG,
-    JUG_HALF,
-)
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tests.support.suite_expert import tick
 
@@ -60,13 +53,13 @@ def poured(env, beside, tilt, seconds=1.0, lean=0.0, speed=0.0):
     cup = np.array((0.3, 0.0, 0.5))
     scene.put("cup", at(cup, lean))
     turn = math.radians(tilt)
-    lip = np.array((-JUG, JUG_HALF)) @ np.array(
+    lip = np.array((-pour.JUG, pour.JUG_HALF)) @ np.array(
         ((math.cos(turn), math.sin(turn)), (-math.sin(turn), math.cos(turn)))
     )
     for step in range(round(seconds * 100) + 30):
         # it is taken away in time, for the last drops to fall
         late = step >= round(seconds * 100)
-        mouth = cup + np.array((beside, -speed * step / 100, CUP_HALF + 0.05))
+        mouth = cup + np.array((beside, -speed * step / 100, pour.CUP_HALF + 0.05))
         scene.put("jug", at(mouth - (0, *lip), 0.0 if late else tilt))
         judge.note(scene, 0.01)
     return judge.figures(scene)
@@ -76,13 +69,15 @@ def poured(env, beside, tilt, seconds=1.0, lean=0.0, speed=0.0):
 def test_it_flows_in_proportion_to_the_tilt(env, tilt):
     env.reset(seed=0)
     figures = poured(env, 0.0, tilt, seconds=0.5)
-    assert figures["poured"] == pytest.approx(FLOW * (tilt - BRIM) * 0.49)  # from the second on
+    assert figures["poured"] == pytest.approx(
+        pour.FLOW * (tilt - pour.BRIM) * 0.49
+    )  # from the second on
     assert figures["spilled"] == 0
 
 
 def test_the_stream_has_to_meet_the_opening(env):
     env.reset(seed=0)
-    inside, outside = (poured(env, share * CUP, 90.0) for share in (0.95, 1.05))
+    inside, outside = (poured(env, share * pour.CUP, 90.0) for share in (0.95, 1.05))
     assert inside["poured"] > 0.6 and inside["spilled"] == 0
     assert outside["spilled"] == pytest.approx(inside["poured"]) and outside["poured"] == 0
     assert poured(env, 0.0, 90.0, lean=14.0)["spilled"] == 0
