@@ -69,9 +69,8 @@ def test_episodes_hold_what_was_seen_of_the_objects(recording, motions):
 
 
 def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
-    assert (folder / "episodes" / "s0" / "summary.json").read_text().count(
-        "true"
-    ) == DEMONSTRATIONS
+    summary = (folder / "episodes" / "s0" / "summary.json").read_text()
+    assert summary.count("true") == DEMONSTRATIONS
     assert np.ptp([slid(motion)[0] for motion in motions[:DEMONSTRATIONS]]) > 0.01
 
 
@@ -140,15 +139,10 @@ def test_what_is_held_is_put_exactly_however_it_slid():
 def test_objects_are_told_apart_by_their_names(folder, settings, monkeypatch):
     """Operators name objects in an order of their own."""
     usual = CarryBenchmark.operators
-    monkeypatch.setattr(
-        CarryBenchmark,
-        "operators",
-        lambda self, orientation, held=True: usual(self, orientation, held)[::-1],
-    )
+    turned = lambda *given, **more: usual(*given, **more)[::-1]  # noqa: E731
+    monkeypatch.setattr(CarryBenchmark, "operators", turned)
     cell = Cell("carry_and_put", "tpgmm", DEMONSTRATIONS, 0)
     trained = TRAININGS["tpgmm"](settings.episodes_in(folder, 0), settings, cell)
     assert trained.policy.frames.frame_names == ("tray", "bottle")
-    assert trained.policy.frames.in_environment == {
-        "bottle": [*range(7)],
-        "tray": [*range(7, 14)],
-    }
+    places = {"bottle": [*range(7)], "tray": [*range(7, 14)]}
+    assert trained.policy.frames.in_environment == places

@@ -15,26 +15,18 @@ from tpgmm_evaluation.processes import run_jobs
 
 @pytest.mark.slow
 def test_jobs_that_fail_or_die_spare_the_others(tmp_path):
-    texts = (
-        "raise ValueError('no such luck')",
-        "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
-        "import pathlib; pathlib.Path(__file__).with_suffix('.done').touch()",
-        "import sys; sys.exit(3)",
-        "import pathlib; pathlib.Path(__file__).with_suffix('.done').touch()",
-    )
+    done = "import pathlib; pathlib.Path(__file__).with_suffix('.done').touch()"
+    killed = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    texts = ("raise ValueError('no such luck')", killed, done, "import sys; sys.exit(3)", done)
     scripts = [tmp_path / f"{number}.py" for number in range(len(texts))]
     for script, text in zip(scripts, texts, strict=True):
         script.write_text(text)
     logs = [script.with_suffix(".txt") for script in scripts]
     # a function that the other processes can import, unlike those of a test
     problems = dict(run_jobs(runpy.run_path, [(str(script),) for script in scripts], 2, logs))
-    assert problems == {
-        0: "ValueError: no such luck",
-        1: "its process ended with code -9",
-        2: None,
-        3: "SystemExit: 3",
-        4: None,
-    }
+    died = "its process ended with code -9"
+    wanted = ("ValueError: no such luck", died, None, "SystemExit: 3", None)
+    assert problems == dict(enumerate(wanted))
     assert "Traceback" in logs[0].read_text()
     assert {path.name for path in tmp_path.glob("*.done")} == {"2.done", "4.done"}
 

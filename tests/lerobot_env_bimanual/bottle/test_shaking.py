@@ -1,14 +1,10 @@
 """The bottle-shaking environment as gymnasium, Stable-Baselines3 and LeRobot see it."""
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.utils.env_checker import check_env as check_by_gymnasium
-from lerobot.envs import env_to_policy_features, make_env, make_env_config
-from stable_baselines3.common.env_checker import check_env as check_by_stable_baselines
+from lerobot.envs import make_env_config
 
 import lerobot_env_bimanual  # noqa: F401  registers the environment
 from lerobot_env_bimanual.bottle.conditions import skill
@@ -25,11 +21,6 @@ from tpgmm_tools.paper.sinusoid import sinusoid
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-FIGURES = {
-    *("grasp_mm", "grasp_deg", "lift_mm", "frequency_hz", "amplitude_rad"),
-    *("frequency_error", "amplitude_error"),
-}
-
 
 def made(**options):
     return gym.make("lerobot_env_bimanual/BottleShaking-v0", **options).unwrapped
@@ -37,25 +28,6 @@ def made(**options):
 
 def home(env):
     return skill().neutral_posture().numpy().astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"episode_length": 5},
-        {"fps": 25, "mode": "kinematic"},
-        {"fps": 50, "pushes": True, "noise": 1.0, "track": True},
-    ],
-    ids=lambda options: "-".join(options),
-)
-def test_the_checkers_of_gymnasium_and_stable_baselines_pass(options):
-    env = made(**options)
-    with warnings.catch_warnings():
-        # actions are angles, not numbers between -1 and 1
-        warnings.filterwarnings("ignore", message=".*symmetric and normalized")
-        check_by_gymnasium(env, skip_render_check=True)
-    scaled = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    check_by_stable_baselines(scaled)
 
 
 def test_observations_stay_in_their_space_whatever_is_done():
@@ -206,36 +178,6 @@ def test_an_action_of_another_robot_or_without_a_value_is_refused():
     assert truncated
     with pytest.raises(DataError, match="call reset first"):
         env.step(home(env))
-
-
-def test_lerobot_makes_fifty_of_them():
-    config = make_env_config("bottle_shaking", fps=25, mode="kinematic", episode_length=3)
-    assert config.type == "bottle_shaking"
-    shapes = {key: value.shape for key, value in env_to_policy_features(config).items()}
-    assert shapes == {
-        "observation.state": (17,),
-        "observation.environment_state": (7,),
-        "action": (17,),
-    }
-    envs = make_env(config, n_envs=50)["bottle_shaking"][0]
-    observation, info = envs.reset(seed=list(range(50)), options={"new": True})
-    assert observation["agent_pos"].shape == (50, 17)
-    assert envs.metadata["render_fps"] == 25
-    assert envs.call("_max_episode_steps") == (3,) * 50
-    assert set(envs.call("task")) == {"shake the bottle"}
-    assert set(envs.call("task_description")) == {
-        "take the bottle with both hands, lift it and shake it"
-    }
-    for _ in range(3):
-        *_, truncated, info = envs.step(observation["agent_pos"].astype(np.float32))
-    assert truncated.all()
-    final = info["final_info"]
-    assert FIGURES | {"is_success", "clipped_rad"} <= set(final)
-    assert not final["is_success"].any()
-    for name in FIGURES:
-        assert final[name].shape == (50,)
-        assert np.isfinite(final[name]).all()
-    envs.close()
 
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():

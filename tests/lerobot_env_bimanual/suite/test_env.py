@@ -1,14 +1,10 @@
 """The suite as gymnasium, Stable-Baselines3 and LeRobot see it; hands, disturbances, noise."""
 
-import warnings
 from functools import partial
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env as check_by_gymnasium
-from lerobot.envs import env_to_policy_features, make_env, make_env_config
-from stable_baselines3.common.env_checker import check_env as check_by_stable_baselines
+from lerobot.envs import make_env_config
 
 import lerobot_env_bimanual  # noqa: F401  registers the environment
 from lerobot_env_bimanual.controlled import NOISE_JOINTS, NOISE_POSE, ControlledEnv
@@ -33,48 +29,10 @@ FPS = 25
 TASK = suite_task("handover")
 
 
-def made(name="handover", **options):
-    return gym.make("lerobot_env_bimanual/Bimanual-v0", task=name, **options).unwrapped
-
-
 @pytest.fixture(scope="module")
 def motion():
     """A handover by an expert."""
     return TASK.demonstrations(2, seed=1, rate=FPS)[0]
-
-
-@pytest.mark.parametrize("robot", TRIED)
-@pytest.mark.parametrize("name", SUITE)
-def test_the_checkers_of_gymnasium_and_stable_baselines_pass(name, robot):
-    env = made(name, robot=robot, fps=50, pushes=True, noise=1.0, episode_length=5)
-    with warnings.catch_warnings():
-        # actions are angles, not numbers between -1 and 1
-        warnings.filterwarnings("ignore", message=".*symmetric and normalized")
-        check_by_gymnasium(env, skip_render_check=True)
-    check_by_stable_baselines(gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1)))
-
-
-@pytest.mark.parametrize("robot", TRIED)
-@pytest.mark.parametrize("name", SUITE)
-def test_lerobot_makes_each_task(name, robot):
-    config = make_env_config("bimanual", task=name, robot=robot, fps=25, episode_length=2)
-    joints = suite_task(name, robot).robot.joint_names
-    shapes = {key: value.shape for key, value in env_to_policy_features(config).items()}
-    assert shapes == {
-        "observation.state": (len(joints),),
-        "observation.environment_state": (7 * len(SUITE[name]),),
-        "action": (len(joints),),
-    }
-    envs = make_env(config, n_envs=2)["bimanual"][0]
-    observation, _ = envs.reset(seed=[0, 1])
-    assert set(envs.call("task")) == {name} and set(envs.call("robot")) == {robot}
-    assert set(envs.call("joint_names")) == {joints}
-    assert set(envs.call("task_description")) == {suite_task(name).description}
-    for _ in range(2):
-        *_, truncated, info = envs.step(observation["agent_pos"].astype(np.float32))
-    assert truncated.all() and not info["final_info"]["is_success"].any()
-    assert {*suite_task(name).figures, "peak_speed"} <= set(info["final_info"])
-    envs.close()
 
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():
