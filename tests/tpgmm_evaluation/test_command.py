@@ -33,9 +33,12 @@ def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
 def called(monkeypatch):
     """The arguments of a comparison that is not made."""
     given = []
-    monkeypatch.setattr(
-        module, "compare", lambda *those: given.extend(those) or Comparison(0, {})
-    )
+
+    def compare(*arguments):
+        given.extend(arguments)
+        return Comparison(0, {})
+
+    monkeypatch.setattr(module, "compare", compare)
     return given
 
 

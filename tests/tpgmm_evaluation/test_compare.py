@@ -24,13 +24,9 @@ from tpgmm_torch.exceptions import UnknownNameError
 
 pytestmark = pytest.mark.slow
 
+OPTIONS = {"mode": "kinematic"}
 SETTINGS = Settings(
-    options={"mode": "kinematic"},
-    rate=20,
-    episodes=2,
-    budget=0.0,
-    validation=2,
-    n_components=20,
+    options=OPTIONS, rate=20, episodes=2, budget=0.0, validation=2, n_components=20
 )
 NEAREST, TPGMM = (Cell("bottle_shaking", policy, 3, 0) for policy in ("nearest", "tpgmm"))
 
