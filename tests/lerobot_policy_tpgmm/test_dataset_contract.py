@@ -127,10 +127,8 @@ def test_values_of_a_robot_are_named_by_somebody(names, told):
 
 @pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])
 def test_joints_are_chosen_by_patterns(joints):
-    made = draccus.parse(
-        TPGMMConfig,
-        args=["--robot=upper_body", f"--joints={joints}", "--device=cpu", "--links=[l_hand]"],
-    )
+    given = ["--robot=upper_body", f"--joints={joints}", "--device=cpu", "--links=[l_hand]"]
+    made = draccus.parse(TPGMMConfig, args=given)
     every = Robot.from_urdf(upper_body_urdf(), []).joint_names
     chosen = [*(name for name in every if name.startswith("l_")), "waist_yaw"]
     assert list(made.kinematics().joint_names) == chosen

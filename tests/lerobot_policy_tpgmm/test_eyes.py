@@ -74,10 +74,8 @@ def test_pictures_count_more_than_the_state_of_the_environment():
     acting, other = seeing(**OPEN), seeing(**OPEN)
     misled = {ENVIRONMENT: batch()[ENVIRONMENT] + 0.3}
     for _ in range(10):
-        one, two = (
-            acting.select_action(observe_start()),
-            other.select_action(observe_start() | misled),
-        )
+        one = acting.select_action(observe_start())
+        two = other.select_action(observe_start() | misled)
     assert torch.equal(one, two)
 
 
@@ -97,16 +95,15 @@ def test_robots_stand_until_all_objects_were_seen(caplog):
     with caplog.at_level("INFO"):
         for _ in range(40):
             assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
-    assert lines(caplog)[-1] == (
-        "holding before the start: robot 1 does not see 'bottle' (a hand hides it)"
-    )
+    waits = "holding before the start: robot 1 does not see 'bottle' (a hand hides it)"
+    assert lines(caplog)[-1] == waits
     for _ in range(4):
         action = acting.select_action(observe_start())
     assert not torch.equal(action, start)
     acting.reset()
-    message = r"robot 1 does not see 'bottle' \(a hand hides it\), for 5 s .*\['front'\]"
     for _ in range(round(5 * RATE)):
         assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
+    message = r"robot 1 does not see 'bottle' \(a hand hides it\), for 5 s .*\['front'\]"
     with pytest.raises(DataError, match=message):
         for _ in range(3):
             acting.select_action(observe_start(lost=[1]))
@@ -152,9 +149,8 @@ def test_what_is_not_seen_for_long_holds_the_robot_and_is_told(caplog):
 def test_most_pictures_may_show_nothing():
     rng = np.random.default_rng(0)
     lost = set(np.flatnonzero(rng.random(160) < 0.7).tolist()) - {0, 1, 2}
-    torch.testing.assert_close(
-        run(seeing(), 160, lost), run(seeing(), 160, ()), rtol=0, atol=0.02
-    )
+    blind, seen = run(seeing(), 160, lost), run(seeing(), 160, ())
+    torch.testing.assert_close(blind, seen, rtol=0, atol=0.02)
 
 
 def test_a_camera_that_was_moved_holds_the_robot_with_its_reason(caplog):
@@ -172,9 +168,8 @@ def test_chunks_stand_while_nothing_can_be_trusted():
     acting = seeing(chunk_size=20)
     start = batch()[STATE][:1]
     for _ in range(2):
-        assert torch.equal(
-            acting.predict_action_chunk(observe_start(rows=1)), start[None].expand(1, 20, -1)
-        )
+        chunk = acting.predict_action_chunk(observe_start(rows=1))
+        assert torch.equal(chunk, start[None].expand(1, 20, -1))
     one = acting.predict_action_chunk(observe_start(rows=1))
     assert float((one[:, -1] - start).abs().max()) > 1e-3
     acting.watch.sources[0].problem = "camera 'front' was moved"
@@ -258,35 +253,32 @@ def test_without_its_cameras_it_reads_poses_and_keeps_the_offsets(tmp_path, no):
 
 
 def test_cells_that_do_not_fit_are_refused(tmp_path):
-    cup = {"cup": {"target": {"tag": 3, "size": 0.06}}}
-    with pytest.raises(DataError, match=r"objects \['cup'\], not \['bottle'\].*cell=none"):
-        policy(cell=cell_content(objects=cup))
-    with pytest.raises(DataError, match=r"joints \['pan', 'lift'\], this one has"):
-        policy(cell=cell_content(joints=["pan", "lift"]))
-    policy(
-        cell=cell_content(joints=[n for n in fitted().kinematics.joint_names if n[0] == "l"])
-    )
     (tmp_path / "cell.json").write_text("{")
-    with pytest.raises(DataError, match=r"cell.json is no JSON"):
-        policy(cell=str(tmp_path / "cell.json"))
-    with pytest.raises(OSError, match=r"nowhere.json"):
-        policy(cell=str(tmp_path / "nowhere.json"))
+    cup = cell_content(objects={"cup": {"target": {"tag": 3, "size": 0.06}}})
+    for cell, error, message in (
+        (cup, DataError, r"objects \['cup'\], not \['bottle'\].*cell=none"),
+        (cell_content(joints=["pan", "lift"]), DataError, r"joints \['pan', .* this one has"),
+        (str(tmp_path / "cell.json"), DataError, r"cell.json is no JSON"),
+        (str(tmp_path / "nowhere.json"), OSError, r"nowhere.json"),
+    ):
+        with pytest.raises(error, match=message):
+            policy(cell=cell)
+    left = [name for name in fitted().kinematics.joint_names if name[0] == "l"]
+    policy(cell=cell_content(joints=left))
 
 
 # Commands
 
 
-def draw_tags(folder, pose, **changed_):
+def draw_tags(folder, pose):
     """A cell with a camera above a tag, which is at a pose (7,), and the picture of that."""
     place = rigid(np.zeros(3), pose[:3])
-    cell = recorded_tags.cell_content(
-        objects={"bottle": {**recorded_tags.OBJECT, "upright": True}}, **changed_
-    )
+    objects = {"bottle": {**recorded_tags.OBJECT, "upright": True}}
+    cell = recorded_tags.cell_content(objects=objects)
     cell["cameras"]["front"]["pose"] = pose_vector(place @ BASE_FROM_CAMERA).tolist()
     (folder / "cell.json").write_text(json.dumps(cell))
-    np.save(
-        folder / "picture.npy", recorded_tags.picture({3: inverse(place) @ pose_matrix(pose)})
-    )
+    picture = recorded_tags.picture({3: inverse(place) @ pose_matrix(pose)})
+    np.save(folder / "picture.npy", picture)
     return folder / "cell.json", folder / "picture.npy"
 
 
@@ -341,9 +333,8 @@ def test_poses_of_a_rendered_environment_are_true():
     acting = changed(fitted(), control_fps=20.0, cell=cell)
     now, _ = env.reset(seed=3)
     for _ in range(5):
-        seen = preprocess_observation(
-            {k: v for k, v in now.items() if k != "environment_state"}
-        )
+        blind = {k: v for k, v in now.items() if k != "environment_state"}
+        seen = preprocess_observation(blind)
         now, *_ = env.step(acting.select_action(seen)[0].numpy())
         [found], true = acting.watch.poses()["bottle"], now["environment_state"]
         np.testing.assert_allclose(found[:3], true[:3], atol=2e-3)

@@ -55,9 +55,8 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
         Demonstration(d.time, d.joints.flip(-1).rad2deg(), d.frames, names)
         for d in bottle_demonstrations()[:3]
     ]
-    save_lerobot(
-        degrees, tmp_path / "set", fps=20, task="shake", units=dict.fromkeys(names, "raw")
-    )
+    units = dict.fromkeys(names, "raw")
+    save_lerobot(degrees, tmp_path / "set", fps=20, task="shake", units=units)
     arguments = (
         "fit", tmp_path / "set", "--robot", "upper_body", "--link", "l_hand", "--link",
         "r_hand", "--units", "deg", "--rate", 5, "--alignment", "none", "--tol", 0.1,

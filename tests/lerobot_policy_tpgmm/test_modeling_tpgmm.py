@@ -18,11 +18,13 @@ from tests.support.policies import (
     grouped,
     played,
     policy,
+    pose,
     situations,
 )
 from tpgmm_control import Controller
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
@@ -131,12 +133,8 @@ def test_objects_are_read_at_the_start_or_followed(follow):
     path[:, :3] += 0.05 * skills.small_bottle().time_[:, None] / skills.small_bottle().time_[-1]
     acting.reset()
     with torch.inference_mode():
-        actions = torch.cat(
-            [
-                acting.select_action({STATE: batch()[STATE][:1], ENVIRONMENT: at[None].float()})
-                for at in path
-            ]
-        )
+        observed = [{STATE: batch()[STATE][:1], ENVIRONMENT: at[None].float()} for at in path]
+        actions = torch.cat([acting.select_action(one) for one in observed])
     seen = path.float().double() if follow else path.float().double()[0]
     [situation] = situations({key: value[:1] for key, value in batch().items()})
     frame = Frame(seen[..., :3], seen[..., 3:])
@@ -179,10 +177,7 @@ def test_tracked_bodies_are_moved_on_their_manifold():
         skills.hands(), **grouped(largest_start_gap=None, **OPEN)
     )
     cup = situation.frames["cup"]
-    observed = {
-        STATE: situation.joints[None].float(),
-        ENVIRONMENT: torch.cat([cup.position, cup.orientation])[None].float(),
-    }
+    observed = {STATE: situation.joints[None].float(), ENVIRONMENT: pose(cup)[None].float()}
     actions = act(acting, observed, len(skills.hands().time_))[0]
     at = observed[ENVIRONMENT][0].double()
     given = Situation(observed[STATE][0].double(), {"cup": Frame(at[:3], at[3:])})
@@ -257,15 +252,13 @@ def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what, caplog):
 
 
 def test_timestamps_tell_how_much_time_has_passed():
-    def told(period):
-        return lambda step, now: {
-            **now,
-            "observation.timestamp": torch.full((2, 1), step * period, dtype=torch.float64),
-        }
+    def stamp(step, now):
+        time = torch.full((2, 1), step * period, dtype=torch.float64)
+        return {**now, "observation.timestamp": time}
 
     for period in (2 / RATE, 1 / (2 * RATE)):
         wanted = run(changed(close_loop(), control_fps=1 / period), 12, as_it_is)
-        assert_close(run(close_loop(), 12, told(period)), wanted.double())
+        assert_close(run(close_loop(), 12, stamp), wanted.double())
 
 
 # Chunks
@@ -321,11 +314,7 @@ def test_estimators_that_cannot_be_written_are_refused():
 
 def test_what_is_held_is_part_of_the_policy(tmp_path):
     model, scene = carrying_model(), scenes(2, seed=9)
-    names = [
-        f"{frame}.{part}"
-        for frame in ("bottle", "tray")
-        for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
-    ]
+    names = [f"{frame}.{part}" for frame in ("bottle", "tray") for part in POSE_PARTS]
     loop = {"clock": "even", "closed_loop": False, "smoothing": None}
     policy = TPGMMPolicy.from_estimator(model, environment_names=names, **grouped(**loop))
     policy.save_pretrained(tmp_path)
@@ -333,9 +322,8 @@ def test_what_is_held_is_part_of_the_policy(tmp_path):
     assert loaded.to_estimator().holds_ == model.holds_
     poses = [x for f in scene.frames.values() for x in (f.position, f.orientation)]
     seen = {STATE: scene.start.float(), ENVIRONMENT: torch.cat(poses, -1).float()}
-    controller = Controller(
-        model.skill, scene.start, scene.frames, **policy.config.control.options()
-    )
+    options = policy.config.control.options()
+    controller = Controller(model.skill, scene.start, scene.frames, **options)
     for now in model.time_.tolist():
         actions = loaded.select_action(seen)
         controller.step(1 / policy.config.rate)

@@ -36,9 +36,8 @@ def test_the_bottle_slides_is_held_and_put_down(mode):
     bottle, tray = poses[:, :7], poses[:, 7:]
     np.testing.assert_array_equal(tray, np.broadcast_to(start.poses["tray"], tray.shape))
     # while the hands close it slides in its own direction, and no more while it is carried
-    forwards = Frame(start.poses["bottle"][:3], start.poses["bottle"][3:]).inverse_transform(
-        Frame(bottle[:, :3], bottle[:, 3:]).position
-    )
+    first = Frame(start.poses["bottle"][:3], start.poses["bottle"][3:])
+    forwards = first.inverse_transform(Frame(bottle[:, :3], bottle[:, 3:]).position)
     assert forwards[round(4.0 * FPS), 0] == pytest.approx(0, abs=1e-3)
     assert forwards[round(4.7 * FPS), 0] == pytest.approx(start.slide[0], abs=1e-3)
     height = bottle[:, 2] - start.poses["bottle"][2]
@@ -117,9 +116,8 @@ def test_situations_are_those_of_the_generator():
     env.reset(seed=7)
     [situation] = carrying().situations(1, seed=7)
     np.testing.assert_array_equal(env._start.joints, situation.joints)
-    np.testing.assert_array_equal(
-        env._start.poses["bottle"][:3], situation.frames["bottle"].position
-    )
+    place = situation.frames["bottle"].position
+    np.testing.assert_array_equal(env._start.poses["bottle"][:3], place)
     slides = []
     for seed in range(100):
         env.reset(seed=seed)

@@ -160,10 +160,11 @@ def test_options_and_actions_that_cannot_be_are_refused():
         with pytest.raises(DataError, match=message):
             made(**wrong)
     env = made()
-    start, _ = env.reset(seed=0)
-    with pytest.raises(ShapeError, match=r"shape \(17,\); it holds references, stiffness and"):
-        env.step(start["agent_pos"])
-    with pytest.raises(DataError, match="not below 0"):
-        env.step(np.concatenate((start["agent_pos"], -SOFT)))
-    with pytest.raises(DataError, match=r"not finite for \['waist_roll'"):
-        env.step(np.concatenate((start["agent_pos"], np.nan * SOFT)))
+    start = env.reset(seed=0)[0]["agent_pos"]
+    for action, error, message in (
+        (start, ShapeError, r"shape \(17,\); it holds references, stiffness and"),
+        (np.concatenate((start, -SOFT)), DataError, "not below 0"),
+        (np.concatenate((start, np.nan * SOFT)), DataError, r"not finite for \['waist_roll'"),
+    ):
+        with pytest.raises(error, match=message):
+            env.step(action)

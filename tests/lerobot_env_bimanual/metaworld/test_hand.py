@@ -10,12 +10,8 @@ from tpgmm_torch.exceptions import UnknownNameError
 
 
 def test_tasks_are_fifty_in_the_published_groups():
-    assert {group: len(names) for group, names in tasks.DIFFICULTIES.items()} == {
-        "easy": 28,
-        "medium": 11,
-        "hard": 6,
-        "very hard": 5,
-    }
+    sizes = {group: len(names) for group, names in tasks.DIFFICULTIES.items()}
+    assert sizes == {"easy": 28, "medium": 11, "hard": 6, "very hard": 5}
     assert len(set(tasks.TASKS)) == 50
     assert list(tasks.TASKS) == sorted(tasks.TASKS)
     assert tasks.TASKS[0::2] == tasks.TUNED

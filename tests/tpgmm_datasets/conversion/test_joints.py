@@ -50,11 +50,11 @@ def rename_state(root, name):
         given = table.column_names
         return table.rename_columns([name if n == "observation.state" else n for n in given])
 
+    def move(info):
+        info["features"][name] = info["features"].pop("observation.state")
+
     change_table(root, DATA, rename)
-    features = lambda i: i["features"]  # noqa: E731
-    change_info(
-        root, lambda i: features(i).update({name: features(i).pop("observation.state")})
-    )
+    change_info(root, move)
 
 
 def test_the_joint_feature_is_found_or_chosen(root):

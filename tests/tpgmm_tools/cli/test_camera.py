@@ -49,8 +49,5 @@ from tpgmm_tools.cli import main
 main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert (
-        done.stderr
-        == "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
-    )
+    said = "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
+    assert (done.returncode, done.stderr) == (2, said)

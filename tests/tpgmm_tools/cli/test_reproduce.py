@@ -55,10 +55,9 @@ def test_reproduce_takes_situations_from_a_file(bottle_model, tmp_path):
     situations = BottleShaking().situations(2)
     items = []
     for one in situations:
-        parts = {
-            k: getattr(one.frames["bottle"], k).tolist() for k in ("position", "orientation")
-        }
-        items.append({"joints": one.joints.tolist(), "frames": {"bottle": parts}})
+        bottle = one.frames["bottle"]
+        pose = {k: getattr(bottle, k).tolist() for k in ("position", "orientation")}
+        items.append({"joints": one.joints.tolist(), "frames": {"bottle": pose}})
     file.write_text(json.dumps(items))
     output("reproduce", bottle_model[0], "--situations", file, "--out", out)
     skill = load_model(bottle_model[0]).skill
