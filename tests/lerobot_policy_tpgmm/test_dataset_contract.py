@@ -109,16 +109,16 @@ def test_several_robots_are_one_text():
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "message"),
     [
         (None, r"does not name the values of observation.state, .*--policy.state_names="),
         ([*NAMES[:16], NAMES[0]], r"'\w+' is there twice.*--policy.state_names="),
         (list(NAMES[:16]), r"16 names for 17 values.*--policy.state_names="),
     ],
 )
-def test_values_of_a_robot_are_named_by_somebody(names, told):
+def test_values_of_a_robot_are_named_by_somebody(names, message):
     state = {STATE: {"dtype": "float32", "shape": (17,), "names": names}}
-    with pytest.raises(DataError, match=told):
+    with pytest.raises(DataError, match=message):
         adopt(config(**UPPER_BODY), dataset(20, **environment(POSE), **state))
     said = config(**UPPER_BODY, state_names=list(NAMES[::-1]))
     adopt(said, dataset(20, **environment(POSE), **state))

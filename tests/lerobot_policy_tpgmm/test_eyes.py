@@ -57,13 +57,13 @@ def test_pictures_are_among_what_it_needs():
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.uint8])
 def test_it_does_what_it_does_with_the_poses_themselves(kind):
-    acting, told = seeing(**OPEN), changed(fitted(), control_fps=RATE, **OPEN)
+    acting, usual = seeing(**OPEN), changed(fitted(), control_fps=RATE, **OPEN)
     start = batch()[STATE]
     for _ in range(2):  # three pictures are looked at before it begins
         assert torch.equal(acting.select_action(observe_start(kind=kind)), start)
     for _ in range(20):
         now = acting.select_action(observe_start(kind=kind))
-        torch.testing.assert_close(now, told.select_action(batch()), rtol=0, atol=1e-5)
+        torch.testing.assert_close(now, usual.select_action(batch()), rtol=0, atol=1e-5)
     before = [source.resets for source in acting.watch.sources]
     acting.reset()
     assert torch.equal(acting.select_action(observe_start()), start)
@@ -224,13 +224,13 @@ def test_it_remembers_the_cell_and_takes_another(tmp_path, caplog):
     other["objects"]["bottle"]["target"] = {"tag": 4, "size": 0.06}
     (tmp_path / "cell.json").write_text(json.dumps(other))
     again = load_again(tmp_path / "policy", tmp_path / "cell.json")
-    [told] = [line for line in lines(caplog) if "another cell" in line]
+    [said] = [line for line in lines(caplog) if "another cell" in line]
     for part in (
         "'front' of the cameras was moved by 20.0 mm and 0.00 deg",
         "'bottle' of the objects has another target",
         "joint 'l_elbow' is offset by +1.15 deg more",
     ):
-        assert part in told
+        assert part in said
     # joints are measured with the offsets of the other cell, and commanded without
     elbow = again.kinematics.joint_names.index("l_elbow")
     joints = again.joints.joints(batch()[STATE].double())
@@ -304,9 +304,9 @@ def test_lerobot_rollout_finds_the_frames_by_itself(tmp_path):
     done, log = rollout(tmp_path, f"--policy.cell={cell}", f"--robot.picture={picture}")
     assert done.returncode == 0, done.stderr
     sent = torch.tensor([list(action.values()) for action in json.loads(log.read_text())])
-    told = changed(fitted(), control_fps=20.0)
+    usual = changed(fitted(), control_fps=20.0)
     one = {key: value[:1] for key, value in batch().items()}
-    wanted = torch.cat([told.select_action(one | {STATE: one[STATE]}) for _ in range(10)])
+    wanted = torch.cat([usual.select_action(one | {STATE: one[STATE]}) for _ in range(10)])
     # it waits for three pictures
     torch.testing.assert_close(sent[2:8], wanted[:6], rtol=0, atol=0.01)
     assert np.ptp(sent.numpy(), axis=0).max() > 0.05

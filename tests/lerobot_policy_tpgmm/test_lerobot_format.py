@@ -17,9 +17,10 @@ from tests.support.skills import bottle_demonstrations, generator, small_bottle
 from tpgmm_control import rollout as reproduced
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration
+from tpgmm_torch.data.pose_names import POSE_PARTS
 
 NAMES = fitted().kinematics.joint_names
-PARTS = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+PARTS = [f"bottle_{part}.pos" for part in POSE_PARTS]
 POSE = dict(zip(PARTS, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True))
 
 BOTTLE = (

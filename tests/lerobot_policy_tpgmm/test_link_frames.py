@@ -94,17 +94,17 @@ def test_episodes_without_the_event_are_named(tmp_path):
             learner.forward(batch)
 
 
-@pytest.mark.parametrize("told", [{}, {"close": "closing:l_gripper"}])
-def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, told):
+@pytest.mark.parametrize("events", [{}, {"close": "closing:l_gripper"}])
+def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, events):
     flags = [one + 0.5 for one in CLOSINGS]
     shown = [demonstrate(seed, closing) for seed, closing in enumerate(CLOSINGS)]
     episodes = [replace(d, events={"close": at}) for d, at in zip(shown, flags, strict=True)]
     save_lerobot(episodes, tmp_path / "set", fps=FPS, task="grip", units={"l_gripper": "raw"})
     data = dataset(tmp_path / "set", episodes=[1, 2, 3])
-    policy = trained(data, link_frames=AT_LINKS, events=told, operators=OPERATORS, **OPTIONS)
-    given = {"robot": robot(), "frames": AT_LINKS, "events": told}
+    policy = trained(data, link_frames=AT_LINKS, events=events, operators=OPERATORS, **OPTIONS)
+    given = {"robot": robot(), "frames": AT_LINKS, "events": events}
     read = load_lerobot(data.root, episodes=[1, 2, 3], **given)
-    when = CLOSINGS if told else flags
+    when = CLOSINGS if events else flags
     assert [one.events["close"] for one in read] == pytest.approx(list(when[1:]), abs=0.11)
     aligned = EventAlignment(robot=robot()).fit_transform(read)
     operators = [parse_operator(OPERATORS[0]), Canonical()]

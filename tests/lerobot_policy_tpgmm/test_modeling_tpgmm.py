@@ -283,13 +283,13 @@ def test_chunks_go_on_from_where_the_robot_is():
     assert_close(actions[:30], whole[0, :30].double(), 1e-3)
 
 
-@pytest.mark.parametrize("told", ["timestamp", "left over"])
-def test_what_tells_the_step_counts_more_than_the_posture(told):
+@pytest.mark.parametrize("source", ["timestamp", "left over"])
+def test_what_tells_the_step_counts_more_than_the_posture(source):
     acting = close_loop(chunk_size=20)
     chunk = acting.predict_action_chunk({**alone(), "observation.timestamp": torch.zeros(1, 1)})
     now = {**alone(), STATE: chunk[0, 3:4]}  # the robot lags behind the seventh action
     more = {}
-    if told == "timestamp":
+    if source == "timestamp":
         now["observation.timestamp"] = torch.full((1, 1), 7 / RATE)
     else:
         more = {"inference_delay": 0, "prev_chunk_left_over": chunk[0, 7:]}

@@ -103,8 +103,8 @@ def test_names_come_before_patterns_and_these_before_the_default(order):
     given = dict([*units, ("*gripper", "rad"), ("left_*", "raw")])
     stored = ("left_gripper.pos", "left_elbow.pos", "right_gripper", "wrist", "up")
     final = ("left_gripper", "left_elbow", "right_gripper", "wrist", "lift")
-    told = units_of(given, stored, final, None, "")
-    assert told == ["mm", "raw", "rad", "deg", "m"]
+    found = units_of(given, stored, final, None, "")
+    assert found == ["mm", "raw", "rad", "deg", "m"]
     assert units_of({"*elbow": "deg"}, stored, final, None, "")[1:3] == ["deg", "auto"]
 
 
@@ -121,5 +121,5 @@ def test_lerobots_units_are_degrees_and_a_grippers_range():
             assert unit == "deg"
     free = robot.drop_limits(["left_gripper", "right_gripper"])
     for other in (None, free, parse_robot("so101")):  # no limits of that joint are known
-        told = units_of("lerobot", stored, robot.joint_names, other, "")
-        assert told == ["raw" if "gripper" in name else "deg" for name in stored]
+        found = units_of("lerobot", stored, robot.joint_names, other, "")
+        assert found == ["raw" if "gripper" in name else "deg" for name in stored]

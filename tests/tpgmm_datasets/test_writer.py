@@ -202,14 +202,14 @@ def test_a_set_with_frames_added_is_the_one_that_had_them(tmp_path, kept):
 
 def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
     given = {"cup": [Frame([0.3, 0, 0])] * 3}
-    for frames, told in (
+    for frames, message in (
         ({"cup": "hand@close"}, r"table .* or frames by episode .*'hand@close'.*LINK@EVENT"),
         ({"bottle": given["cup"]}, r"frames \['bottle'\] some are in the set"),
         ({}, "by episode can be added, got {}"),
         ({"cup": given["cup"][:2]}, "list of 2 Frame"),
         ({"cup": [Frame(np.zeros((12, 3)))] * 3}, "episode 1: frame 'cup' has 12 poses"),
     ):
-        with pytest.raises(DatasetError, match=told):
+        with pytest.raises(DatasetError, match=message):
             add_frames(root, tmp_path / "copy", frames)
     with pytest.raises(DatasetError, match=r"sets of v3\.0, this is v2\.1 .*dataset convert"):
         add_frames(to_v21(root, tmp_path / "old"), tmp_path / "copy", given)

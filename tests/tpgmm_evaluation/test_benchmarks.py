@@ -112,12 +112,10 @@ def test_places_leave_the_error_of_the_grasp(folder, settings):
 
 def test_what_is_held_is_put_exactly_however_it_slid():
     benchmark = CarryBenchmark(rate=25)
-    demonstrations = DynamicTimeWarping(features=["directions"]).fit_transform(
-        benchmark.skill.demonstrations(10, seed=0)
-    )
-    model = TaskParameterizedGMM(
-        benchmark.n_components, benchmark.operators(orientation=True), benchmark.robot
-    ).fit(attach_holds(demonstrations, benchmark.robot))
+    shown, operators = benchmark.skill.demonstrations(10, seed=0), benchmark.operators(True)
+    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(shown)
+    model = TaskParameterizedGMM(benchmark.n_components, operators, benchmark.robot)
+    model.fit(attach_holds(aligned, benchmark.robot))
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("bottle", "l_hand")
     policy = TPGMMPolicy.from_estimator(model, environment_names=NAMES)

@@ -67,11 +67,8 @@ def test_both_policies_were_rolled_out_on_the_same_seeds(folder):
         assert [episode["seed"] for episode in result["episodes"]] == seeds
         assert result["latency"]["step_median_ms"] > 0
         assert result["training"]["fps"] == 20
-    grasps = {
-        cell: [episode["grasp_mm"] for episode in results.read(cell)["episodes"]]
-        for cell in (NEAREST, TPGMM)
-    }
-    assert max(grasps[TPGMM]) < min(grasps[NEAREST])
+    theirs, ours = (results.read(cell)["episodes"] for cell in (NEAREST, TPGMM))
+    assert max(one["grasp_mm"] for one in ours) < min(one["grasp_mm"] for one in theirs)
 
 
 def test_tables_and_report_say_what_the_cells_hold(whole):

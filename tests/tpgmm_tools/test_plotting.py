@@ -121,13 +121,11 @@ def test_candidates_that_matter_stand_above_the_others():
     [axes] = plotting.figure(1, "").axes
     plotting.plot_relevance(axes, selection)
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    kept = {
-        format_operator(selection.candidates_[j]) for j in np.flatnonzero(selection.support_)
-    }
+    names = [format_operator(one) for one in selection.candidates_]
+    kept = {names[j] for j in np.flatnonzero(selection.support_)}
     assert set(labels[: len(kept)]) == kept and len(labels) == len(selection.candidates_)
     [image] = axes.images
-    column = [format_operator(one) for one in selection.candidates_].index(labels[0])
-    np.testing.assert_allclose(
-        image.get_array()[0], selection.relevance_[:, column].clip(min=0)
-    )
+    column = names.index(labels[0])
+    wanted = selection.relevance_[:, column].clip(min=0)
+    np.testing.assert_allclose(image.get_array()[0], wanted)
     assert [line.get_ydata()[0] for line in axes.lines] == [len(kept) - 0.5]

@@ -184,10 +184,9 @@ def test_lerobot_makes_the_environment():
 
 
 def test_no_display_no_drawing_and_no_warning():
-    program = (
-        "from lerobot_env_bimanual.aloha.state import AlohaStateEnv; env = AlohaStateEnv()"
-    )
-    program += "; env.reset(seed=0); env.step(env.action_space.low * 0)"
+    module = "lerobot_env_bimanual.aloha.state"
+    program = f"from {module} import AlohaStateEnv; env = AlohaStateEnv(); env.reset(seed=0); "
+    program += "env.step(env.action_space.low * 0)"
     hidden = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"}
     environment = {k: v for k, v in os.environ.items() if k not in hidden}
     command = [sys.executable, "-c", program]

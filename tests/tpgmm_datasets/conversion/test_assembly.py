@@ -126,8 +126,8 @@ def test_start_and_end_are_where_a_link_is_first_and_last(root, options):
         ({"events": {"close": "closing:claw"}}, "no signal is called 'claw'"),
     ],
 )
-def test_links_and_events_that_are_none_are_refused(gripping, given, told):
-    with pytest.raises(DataError, match=told):
+def test_links_and_events_that_are_none_are_refused(gripping, given, message):
+    with pytest.raises(DataError, match=message):
         load_lerobot(gripping, robot=ARM, **given)
 
 

@@ -82,9 +82,11 @@ def test_what_is_held_is_found_in_measured_joints(tmp_path):
 @pytest.mark.parametrize("name", ["observation.states.joint.position", "measured", "arm.qpos"])
 def test_commands_in_place_of_an_unusual_state_are_told_once(root, name):
     rename_state(root, name)
-    with pytest.warns(PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'") as told:
+    with pytest.warns(
+        PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'"
+    ) as caught:
         commands = joints_of(load_lerobot(root))
-    assert len(told) == 1
+    assert len(caught) == 1
     assert_equal(joints_of(load_lerobot(root, joints="commanded")), commands)
     measured = joints_of(load_lerobot(root, joints=name))
     assert_equal([m[1:] for m in measured], [c[:-1] for c in commands])

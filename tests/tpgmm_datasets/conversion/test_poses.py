@@ -21,12 +21,8 @@ POSITION = np.array([0.1, -0.2, 0.3])
 RPY = np.array([0.3, -0.5, 1.1])
 
 
-def euler_matrix(roll, pitch, yaw):
-    return Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
-
-
-QUATERNION = quaternions.from_matrix(torch.from_numpy(euler_matrix(*RPY)))
-YAW = quaternions.from_matrix(torch.from_numpy(euler_matrix(0, 0, RPY[2])))
+QUATERNION = quaternions.from_matrix(torch.tensor(Rotation.from_euler("xyz", RPY).as_matrix()))
+YAW = quaternions.exp(torch.tensor([0.0, 0.0, RPY[2]], dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
@@ -154,13 +150,13 @@ def test_frames_are_given_for_all_episodes_that_are_read(root):
             assert one.frames["cup"].position.tolist() == frame.position.tolist()
     [last] = load_lerobot(root, frames={"cup": by_index}, episodes=[2])
     assert last.frames["cup"].position[0] == several[2].position[0]
-    for wrong, told in (
+    for wrong, said in (
         (several[:2], "got list of 2 Frame"),
         (several * 2, "got list of 6 Frame"),
         ({0: several[0], 1: several[1]}, "got dict of 2 Frame"),
         (by_index | {7: several[0]}, "got dict of 4 Frame"),
     ):
-        message = rf"'cup' is .* one for each .* 0, 1, 2, .*{told}"
+        message = rf"'cup' is .* one for each .* 0, 1, 2, .*{said}"
         with pytest.raises(DatasetError, match=message):
             load_lerobot(root, frames={"cup": wrong})
 
@@ -176,7 +172,7 @@ def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
 
 
 @pytest.mark.parametrize(
-    ("make", "given", "told"),
+    ("make", "given", "said"),
     [
         (LinkPose.parse, "hand@close+0,0", "behind [+] is the object"),
         (LinkPose.parse, "hand@close+0,0,up", "behind [+] is"),
@@ -185,6 +181,6 @@ def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
         (partial(FramePose, "x", None), "wzyx", "rotation 'wzyx'"),
     ],
 )
-def test_offsets_and_rotations_that_are_none_are_refused(make, given, told):
-    with pytest.raises(DatasetError, match=told):
+def test_offsets_and_rotations_that_are_none_are_refused(make, given, said):
+    with pytest.raises(DatasetError, match=said):
         make(given)

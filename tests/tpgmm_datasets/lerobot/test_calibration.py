@@ -114,11 +114,11 @@ def test_values_in_degrees_and_units_for_all_are_refused(arm, file):
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda values: 1.2 * values))
     with pytest.raises(DatasetError, match=r"goes from -120 to .*use_degrees.*units='deg'"):
         load_lerobot(arm, joints="arm", calibration=file)
-    for options, told in (
+    for options, message in (
         ({"calibration": file, "units": "deg"}, "give one of them"),
         ({"calibration": file.with_name("leg.json")}, r"cannot be read: .*leg\.json"),
         ({"calibration": 3}, "several by prefix; got"),
         ({"calibration": {"left_": None}}, "several by prefix; got"),
     ):
-        with pytest.raises(DatasetError, match=told):
+        with pytest.raises(DatasetError, match=message):
             load_lerobot(arm, joints="arm", **options)

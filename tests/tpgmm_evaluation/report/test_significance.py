@@ -103,7 +103,7 @@ def test_without_others_there_is_nothing_to_compare():
 
 
 @pytest.mark.parametrize(
-    ("counts", "p", "told"),
+    ("counts", "p", "wanted"),
     [
         ((9, 0), 0.01, "better"),
         ((3, 0), 0.25, "better, not significantly"),
@@ -112,8 +112,8 @@ def test_without_others_there_is_nothing_to_compare():
         ((1, 20), 0.001, "worse"),
     ],
 )
-def test_verdicts(counts, p, told):
-    assert significance.verdict(*counts, p) == told
+def test_verdicts(counts, p, wanted):
+    assert significance.verdict(*counts, p) == wanted
 
 
 def test_tasks_count_alike_however_many_pairs_they_have():

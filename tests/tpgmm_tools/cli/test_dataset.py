@@ -108,8 +108,8 @@ def test_measured_poses_are_added_to_a_copy(arm, tmp_path):
     for n, found in enumerate(load_lerobot(tmp_path / "new")):
         assert list(found.frames) == ["bottle", "cup"]
         assert found.frames["cup"].position[0] == pytest.approx(0.3 + 0.1 * n)
-    told = refusal("dataset", "add-frames", arm[0], *frame, "--out", tmp_path / "new")
-    assert "exists; remove it" in told
+    said = refusal("dataset", "add-frames", arm[0], *frame, "--out", tmp_path / "new")
+    assert "exists; remove it" in said
 
 
 @pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])
@@ -167,7 +167,8 @@ def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, shaki
     root = save_lerobot([*shown, shown[0]], tmp_path / "copies", fps=10, task="t")
     assert "unlikely: copies: " in output("dataset", "check", root)
     assert run("dataset", "check", root, "--strict").exit_code == 1
-    undeclared(write_degrees(tmp_path / "degrees"), 1.0)
+    write(tmp_path / "degrees")
+    undeclared(tmp_path / "degrees", 600.0)
     text = output("dataset", "check", tmp_path / "degrees")
     assert "cannot say whether it is plausible: " in text and "not radians" in text
     result = run("dataset", "check", tmp_path / "degrees", "--units", "rad", *robot)
@@ -190,12 +191,6 @@ def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, shakin
     with pytest.warns(DatasetWarning, match="norm of a quaternion"):
         [second] = load_lerobot(root, relax=["poses"])
     assert_same([second], load_lerobot(shaking)[1:])
-
-
-def write_degrees(folder):
-    write(folder)
-    change_table(folder, DATA, lambda t: set_column(t, "observation.state", lambda x: 600 * x))
-    return folder
 
 
 def bad_set(folder, wrong):
