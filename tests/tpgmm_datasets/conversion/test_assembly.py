@@ -117,7 +117,7 @@ def test_start_and_end_are_where_a_link_is_first_and_last(root, options):
 
 
 @pytest.mark.parametrize(
-    "given, told",
+    "given, message",
     [
         ({"frames": {"cup": "@close"}}, "LINK@EVENT"),
         ({"frames": {"cup": "hand@a@b"}}, "LINK@EVENT"),
