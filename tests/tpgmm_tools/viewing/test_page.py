@@ -21,12 +21,6 @@ from tpgmm_torch.exceptions import DependencyError
 pytestmark = pytest.mark.slow
 
 
-def reproduce(model, situation):
-    """Reproduce within the robot's bounds, led in from the start posture."""
-    [trajectory] = rollout(model.skill, [situation], bounds="robot", blend=1.0)
-    return trajectory
-
-
 @pytest.fixture(scope="module")
 def motion(tmp_path_factory):
     """Write a page; return it, the reproduction in it, and the situation."""
@@ -102,7 +96,7 @@ def test_live_an_object_that_is_moved_changes_the_reproduction(capsys):
             (lambda: view.show(1), other),
         ):
             change()
-            trajectory = reproduce(model, expected)
+            [trajectory] = rollout(model.skill, [expected], bounds="robot", blend=1.0)
             torch.testing.assert_close(view.drawing.trajectory.joints, trajectory.joints)
         start = time.monotonic()
         view.run(0.3)
