@@ -252,8 +252,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         DataError, ShapeError, UnknownNameError, PlausibilityError, NotFittedError
             If a situation does not fit the model, or cannot be what it is taken for.
         """
-        skill: Any = self.skill
-        return reproduce(skill, X, candidates=candidates)
+        return reproduce(self.skill, X, candidates=candidates)
 
     def step(
         self,
@@ -331,8 +330,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         DataError
             If ``n_samples`` is no positive integer, and as :meth:`predict` does.
         """
-        skill: Any = self.skill
-        return sample(skill, situation, n_samples, random_state)
+        return sample(self.skill, situation, n_samples, random_state)
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:
         """Mean log-likelihood per time step of local coordinates and time; higher is better.

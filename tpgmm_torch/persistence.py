@@ -70,7 +70,7 @@ ACCEPTED: dict[Any, Any] = {float: (float, int), Any: object, Skill: object}
 LEARNED = ("weights", "means", "covariances", "time", "holds", "n_demonstrations")
 
 
-def save(model: Any, path: str | Path) -> None:
+def save(model: TaskParameterizedGMM | Skill, path: str | Path) -> None:
     """Write a fitted model or a skill to a folder, atomically.
 
     Parameters
@@ -125,7 +125,9 @@ def _digest(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None) -> Any:
+def load(
+    path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
+) -> TaskParameterizedGMM | Skill:
     """Read a model or a skill; nothing in its folder is executed.
 
     Parameters
@@ -216,7 +218,7 @@ def load_model(
 
 def load_skill(
     path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
-) -> Any:
+) -> Skill:
     """:func:`tpgmm_torch.load` what runs: a skill, or that of an estimator.
 
     Parameters
@@ -437,7 +439,7 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
         yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
 
 
-def validate(model: Any) -> Any:
+def validate[Model: (TaskParameterizedGMM, Skill)](model: Model) -> Model:
     """Validate a model or a skill by running it once; returns it.
 
     Parameters

@@ -21,6 +21,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import default_operators
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_components import SelectComponents
@@ -161,7 +162,7 @@ def prepare_demonstrations(
 
 def learn(
     model: TaskParameterizedGMM, source: Any, choices: Choices, processes: Processes = ALONE
-) -> tuple[Any, list[str]]:
+) -> tuple[TaskParameterizedGMM | Skill, list[str]]:
     """Fit a model, with what is to be found first.
 
     Parameters

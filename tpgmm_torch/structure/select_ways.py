@@ -20,6 +20,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.ways import Ways
 from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
@@ -201,7 +202,7 @@ class SelectWays(DemonstrationEstimator):
         shown = [[one for k, one in pairs if k == way] for way in range(self.n_ways_)]
         self.models_ = [clone(self.model).fit(own) for own in shown]
         self.skill_: Ways | Regression = self.models_[0].skill
-        self.best_model_: Any = self.models_[0]
+        self.best_model_: TaskParameterizedGMM | Skill = self.models_[0]
         if self.n_ways_ > 1:
             skills = tuple(model.skill for model in self.models_)
             limits = tuple(map(_largest_surprise, skills, shown))
