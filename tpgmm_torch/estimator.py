@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.mixture.processes import ALONE, Processes
@@ -258,7 +258,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         self,
         time: float | Tensor,
         state: RobotState | Any,
-        frames: Mapping[str, Frame] | None = None,
+        frames: Frames | None = None,
         *,
         candidates: bool = False,
     ) -> Estimate:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import IMPOSSIBLE
 from tpgmm_torch.data.arrays import as_array
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.robots.kinematics import Kinematics
 
 #: Within this share of a skill's duration from its begin, a posture is a start.
@@ -21,7 +21,7 @@ START = 0.02
 
 def check_situations(
     joints: Tensor,
-    frames: Mapping[str, Frame],
+    frames: Frames,
     times: Tensor,
     kinematics: Kinematics,
     learned: Tensor,

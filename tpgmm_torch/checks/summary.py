@@ -14,7 +14,7 @@ from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import EpisodeSummary, PathSummary, differing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -131,7 +131,7 @@ class FrameSummary:
             raise DataError(f"a frame is at LINK@EVENT, got {self.at!r:.60}")
 
     @classmethod
-    def of(cls, paths: Sequence[PathSummary], links: Mapping[str, Frame]) -> Self:
+    def of(cls, paths: Sequence[PathSummary], links: Frames) -> Self:
         """Summarise the poses of a frame in all demonstrations.
 
         Parameters
@@ -264,7 +264,7 @@ class TrainingSummary:
             differing(np.concatenate([one.postures for one in episodes])).round(4).tolist(),
         )
 
-    def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
+    def novelty(self, joints: Any = None, frames: Frames | None = None) -> Array:
         """Measure the distance from the demonstrations, in units of the furthest of these.
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
@@ -318,9 +318,7 @@ class TrainingSummary:
         state = kinematics.state(joints)
         return {name: state.pose(link) for name, link in links.items()}
 
-    def findings(
-        self, joints: Any, frames: Mapping[str, Frame], label: str = ""
-    ) -> list[Finding]:
+    def findings(self, joints: Any, frames: Frames, label: str = "") -> list[Finding]:
         """Name the coordinates of one situation that make it unlike the demonstrations.
 
         Parameters
@@ -385,9 +383,7 @@ class TrainingSummary:
             ) from error
         return summary
 
-    def _distances(
-        self, joints: Any, frames: Mapping[str, Frame]
-    ) -> dict[tuple[str, str], Array]:
+    def _distances(self, joints: Any, frames: Frames) -> dict[tuple[str, str], Array]:
         """Compute distances (...) of situations from each region, by its kind and frame."""
         found: dict[tuple[str, str], Array] = {}
         if joints is not None and len(self.compared):

@@ -34,7 +34,7 @@ supported radial functions of minimal degree, Advances in Computational Mathemat
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Self
@@ -43,10 +43,10 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import Residual
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.robots.kinematics import Bounds, Kinematics, RobotState
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_point import ViaPoint
 
@@ -123,9 +123,7 @@ class Request:
         variances = like.new_tensor(point.variances(size))[rows]
         return cls(Residual.of(operator, kinematics), wanted, rows, variances)
 
-    def displacement(
-        self, state: RobotState, frames: Mapping[str, Frame]
-    ) -> tuple[Tensor, Tensor]:
+    def displacement(self, state: RobotState, frames: Frames) -> tuple[Tensor, Tensor]:
         """Compute the displacement ``r`` (..., m) and minus its derivative (..., m, n)."""
         _, residual, jacobian, _ = self.term(self.coordinates, state, frames)
         n = state.joints.shape[-1]
@@ -151,7 +149,7 @@ class Surroundings:
     """
 
     skill: Skill
-    frames: Mapping[str, Frame]
+    frames: Frames
     held: RobotState | None = None
 
     def state(self, joints: Tensor) -> RobotState:
@@ -159,9 +157,7 @@ class Surroundings:
         state = self.skill.kinematics.state(joints)
         return state if self.held is None else _attach_objects(state, self.held)
 
-    def estimate(
-        self, time: Tensor, joints: Tensor, bounds: tuple[Tensor, Tensor] | None = None
-    ) -> Estimate:
+    def estimate(self, time: Tensor, joints: Tensor, bounds: Bounds = None) -> Estimate:
         """Estimate the skill at ``time``, linearised at ``joints``, within ``bounds``."""
         given = joints if self.held is None else self.state(joints)
         return self.skill.estimate(time, given, self.frames, bounds)

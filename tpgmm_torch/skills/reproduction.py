@@ -5,7 +5,7 @@ Nothing is measured, and nothing bounds the references: a skill alone, and what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
@@ -67,9 +67,7 @@ def reproduce(
     return with_novelty(skill, known, done)
 
 
-def open_loop(
-    skill: Skill, start: Tensor, poses: Mapping[str, Frame], grid: Sequence[float]
-) -> list[Tick]:
+def open_loop(skill: Skill, start: Tensor, poses: Frames, grid: Sequence[float]) -> list[Tick]:
     """References at the times of a grid, from start postures (..., n_joints) on.
 
     Parameters
@@ -105,7 +103,7 @@ def open_loop(
     return done
 
 
-def _poses_at(k: int, poses: Mapping[str, Frame], moving: set[str]) -> dict[str, Frame]:
+def _poses_at(k: int, poses: Frames, moving: set[str]) -> dict[str, Frame]:
     """Select the poses at an instant, where they move."""
     return {name: pose[k] if name in moving else pose for name, pose in poses.items()}
 
@@ -211,7 +209,7 @@ def _candidates(
     skill: Skill,
     time: torch.Tensor,
     joints: torch.Tensor,
-    frames: Mapping[str, Frame],
+    frames: Frames,
     holdings: Sequence[Holding],
     whole: Estimate,
 ) -> list[Candidate]:
@@ -243,9 +241,7 @@ def _stretches(holdings: Sequence[Holding], size: int) -> Iterator[slice]:
             start = k
 
 
-def _together(
-    holdings: Sequence[Holding], frames: Mapping[str, Frame], batch: Sequence[int]
-) -> Holding:
+def _together(holdings: Sequence[Holding], frames: Frames, batch: Sequence[int]) -> Holding:
     """Several instants (T, B) at which the robots hold the same things."""
     places = dict(frames)
     for name in holdings[0].held:
@@ -257,7 +253,7 @@ def _together(
     return replace(holdings[0], frames=places)
 
 
-def _at(frames: Mapping[str, Frame], now: slice) -> dict[str, Frame]:
+def _at(frames: Frames, now: slice) -> dict[str, Frame]:
     """Frames of shape (B,) or, if they move, (T, B) at some instants."""
     return {name: f[now] if len(f.batch_shape) == 2 else f for name, f in frames.items()}
 

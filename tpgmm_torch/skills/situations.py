@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import Skill
 
 
-def complete_frames(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
+def complete_frames(skill: Skill, joints: Any, frames: Frames) -> dict[str, Frame]:
     """Frames, and those that are not given but follow from the start posture.
 
     Parameters
@@ -101,9 +101,7 @@ def _complete(skill: Skill, given: Situation | Demonstration) -> Situation:
     return Situation(given.joints.to(like), frames, time)
 
 
-def report_start(
-    skill: Skill, joints: Any, frames: Mapping[str, Frame], time: Tensor | None = None
-) -> None:
+def report_start(skill: Skill, joints: Any, frames: Frames, time: Tensor | None = None) -> None:
     """Warn of start postures and frames unlike those of the demonstrations.
 
     Parameters
@@ -127,7 +125,7 @@ def report_start(
 
 
 def tick_inputs(
-    skill: Skill, time: Any, state: RobotState | Any, frames: Mapping[str, Frame]
+    skill: Skill, time: Any, state: RobotState | Any, frames: Frames
 ) -> tuple[Tensor, Tensor | RobotState, dict[str, Frame]]:
     """Time, joints and frames as tensors of the robot's dtype and device.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.demonstrations import Situation
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.posture import PostureSearch
-from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import Bounds, RobotState
 from tpgmm_torch.skills.conditioning import Cluster, Request, Surroundings
 from tpgmm_torch.skills.skill import CompositeSkill, Skill
 from tpgmm_torch.skills.via_point import ViaPoint
@@ -115,11 +115,7 @@ class ViaPoints(CompositeSkill):
         return self if skill is self.skill else replace(self, skill=skill)
 
     def estimate(
-        self,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames, bounds: Bounds = None
     ) -> Estimate:
         """Estimate the skill, given the via-points; see :meth:`Skill.estimate`."""
         joints, held = (state, None) if isinstance(state, Tensor) else (state.joints, state)
@@ -155,12 +151,12 @@ class ViaPoints(CompositeSkill):
         return given, Memory(self.memory.clusters, tuple(moved), shift)
 
     def candidates(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+        self, time: Tensor, state: RobotState, frames: Frames, estimate: Estimate
     ) -> tuple[Candidate, ...]:
         """Return those of the skill; see :meth:`Skill.candidates`."""
         return self.skill.candidates(time, state, frames, estimate)
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+    def start(self, joints: Tensor, frames: Frames) -> Self:
         """Condition on the same points; see :meth:`Skill.start`."""
         return type(self)(self.skill.start(joints, frames), self.points, self.fade)
 
@@ -206,9 +202,7 @@ class ViaPoints(CompositeSkill):
             findings += self.skill.report_misses(situations, trajectories)
         return Report.of(findings, f"{len(situations)} situations with via-points")
 
-    def _miss(
-        self, point: ViaPoint, done: Trajectory, frames: Mapping[str, Frame]
-    ) -> float | None:
+    def _miss(self, point: ViaPoint, done: Trajectory, frames: Frames) -> float | None:
         """Measure by how much references miss a via-point [m, rad]; None if they do not."""
         time = done.time
         step = int((time - point.time).abs().argmin())

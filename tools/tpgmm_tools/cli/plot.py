@@ -100,7 +100,7 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
 
 
 def _leaf_names(operator: Any, kinematics: Kinematics) -> list[str]:
-    """Label joints, metres, forces, parts of rotation vectors and quaternions; number others."""
+    """Label joints, metres, forces, parts of turns, and number all else."""
     names, count = kinematics.joint_names, operator.dimension(kinematics)
     if operator.is_posture:
         return [names[column] for column in operator.columns(names)]
