@@ -98,30 +98,24 @@ class Request:
         Of the via-point's operator.
     coordinates : Tensor of shape (D,)
         Wanted local coordinates of the operator.
-    rows : Tensor of int, of shape (m,)
-        Indices of the operator's displacements that count.
     variances : Tensor of shape (m,)
         Of these [m^2, rad^2].
     """
 
     term: Residual
     coordinates: Tensor
-    rows: Tensor
     variances: Tensor
 
     @classmethod
     def of(cls, point: ViaPoint, kinematics: Kinematics) -> Self:
         """Make the request of a ``point`` of the robot that ``kinematics`` describe."""
-        wanted, columns = point.coordinates(kinematics)
-        like, operator = kinematics.lower, point.operator
+        like, operator, wanted = kinematics.lower, point.operator, point.coordinates(kinematics)
         posture = torch.zeros_like(like)
         posture[list(kinematics.quaternion_starts)] = 1.0
         anywhere = dict.fromkeys(operator.references(), Frame(like.new_zeros(3)))
         at = operator.linearize(kinematics.state(posture), anywhere)
-        size = at.displacement.shape[-1]
-        rows = torch.tensor([*range(size)] if columns is None else columns, device=like.device)
-        variances = like.new_tensor(point.variances(size))[rows]
-        return cls(Residual.of(operator, kinematics), wanted, rows, variances)
+        variances = like.new_tensor(point.variances(at.displacement.shape[-1]))
+        return cls(Residual.of(operator, kinematics), wanted, variances)
 
     def displacement(self, state: RobotState, frames: Frames) -> tuple[Tensor, Tensor]:
         """Compute the displacement ``r`` (..., m) and minus its derivative (..., m, n)."""
@@ -130,8 +124,7 @@ class Request:
         if jacobian is None:
             jacobian = torch.eye(n, dtype=residual.dtype, device=residual.device)
         batch = gaussians.common_shape(residual.shape[:-1], jacobian.shape[:-2])
-        residual = residual.expand(*batch, -1)[..., self.rows]
-        return residual, jacobian.expand(*batch, -1, n)[..., self.rows, :]
+        return residual.expand(*batch, -1), jacobian.expand(*batch, -1, n)
 
 
 @dataclass(frozen=True, eq=False)

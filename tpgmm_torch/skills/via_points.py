@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -36,14 +36,14 @@ class Memory:
     ----------
     clusters : tuple of Cluster
         What is asked for, by times.
-    moved : tuple of Tensor of shape (..., A n_joints)
-        ``e_a`` of each cluster at the last tick; None where it did not count.
+    moved : mapping of int to Tensor of shape (..., A n_joints)
+        ``e_a`` at the last tick of each cluster that counted, by its number.
     shift : Tensor of shape (..., n_joints), optional
         ``e_t`` of the last tick; None where nothing was moved.
     """
 
     clusters: tuple[Cluster, ...] = ()
-    moved: tuple[Tensor | None, ...] = ()
+    moved: Mapping[int, Tensor] = field(default_factory=dict)
     shift: Tensor | None = None
 
 
@@ -85,12 +85,8 @@ class ViaPoints(CompositeSkill):
         if not self.fade > 0:
             raise DataError(f"via-points fade over a positive time, got {self.fade} s")
         clusters = Cluster.group(points, self.skill.kinematics, self.fade)
-        for name, value in {
-            "points": tuple(points),
-            "fade": float(self.fade),
-            "memory": Memory(clusters, (None,) * len(clusters)),
-        }.items():
-            object.__setattr__(self, name, value)
+        memory = Memory(clusters)
+        vars(self).update(points=tuple(points), fade=float(self.fade), memory=memory)
 
     @property
     def skills(self) -> tuple[Skill]:  # type: ignore[override]
@@ -126,8 +122,7 @@ class ViaPoints(CompositeSkill):
         free = around.estimate(time, joints, bounds)
         skill = self.skill.advance(free)
         if not any(cluster.counts(time) for cluster in clusters):
-            memory = Memory(clusters, (None,) * len(clusters))
-            return replace(free, after=replace(self, skill=skill, memory=memory))
+            return replace(free, after=replace(self, skill=skill, memory=Memory(clusters)))
         if not bool(free.joints.isfinite().all()):  # no estimate: stay
             kept = free.joints if self.memory.shift is None else free.joints + self.memory.shift
             return replace(free, joints=kept, after=replace(self, skill=skill))
@@ -139,16 +134,15 @@ class ViaPoints(CompositeSkill):
         self, time: Tensor, free: Estimate, around: Surroundings
     ) -> tuple[Estimate, Memory]:
         """Condition an estimate on all clusters."""
-        here, moved = around.estimate(time, free.joints), list[Tensor | None]()
+        here, moved = around.estimate(time, free.joints), dict[int, Tensor]()
         shift, covariance = torch.zeros_like(here.joints), here.covariance
-        for cluster, last in zip(self.memory.clusters, self.memory.moved, strict=True):
-            there = None
+        for k, cluster in enumerate(self.memory.clusters):
             if cluster.counts(time):
-                more, narrowed, there = cluster.condition(time, here, around, last)
+                last = self.memory.moved.get(k)
+                more, narrowed, moved[k] = cluster.condition(time, here, around, last)
                 shift, covariance = shift + more, covariance - narrowed
-            moved.append(there)
         given = replace(free, joints=here.joints + shift, covariance=covariance)
-        return given, Memory(self.memory.clusters, tuple(moved), shift)
+        return given, Memory(self.memory.clusters, moved, shift)
 
     def candidates(
         self, time: Tensor, state: RobotState, frames: Frames, estimate: Estimate
@@ -165,7 +159,7 @@ class ViaPoints(CompositeSkill):
         some, shift = super().of_robots(robots), self.memory.shift
         if shift is None or shift.ndim == 1:
             return some
-        moved = tuple(None if one is None else one[robots] for one in self.memory.moved)
+        moved = {k: one[robots] for k, one in self.memory.moved.items()}
         return replace(some, memory=Memory(self.memory.clusters, moved, shift[robots]))
 
     def posture_search(self) -> PostureSearch | None:
