@@ -86,8 +86,7 @@ class Region:
         offset = vectors - np.array(self.mean)
         precision = np.linalg.inv(np.array(self.covariance).reshape(d, d))
         squared = np.einsum("...i,ij,...j->...", offset, precision, offset)
-        distance: Array = np.sqrt(squared / (d + 2 * np.sqrt(2 * d)))
-        return distance
+        return np.asarray(np.sqrt(squared / (d + 2 * np.sqrt(2 * d))))
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ class TrainingSummary:
 
     def __post_init__(self) -> None:
         n, count = len(self.joint_names), self.n_demonstrations
-        compared = _count_indices(self.compared, n)
+        compared = sum(type(value) is int and 0 <= value < n for value in {*self.compared})
         _check_numbers(
             self,
             n_demonstrations=(),
@@ -473,8 +472,7 @@ def _norm(distances: Iterable[Array]) -> Array:
     total = np.zeros(())
     for distance in distances:
         total = total + np.where(np.isnan(distance), 0.0, distance) ** 4
-    joined: Array = total ** (1 / 4)
-    return joined
+    return np.asarray(total ** (1 / 4))
 
 
 def _rows(joints: Any) -> Array:
@@ -512,11 +510,6 @@ def _rotation_vectors(mean: Array, orientations: Array) -> Array:
         quaternions.conjugate(torch.from_numpy(mean)), torch.from_numpy(np.array(orientations))
     )
     return as_array(quaternions.log(turns))
-
-
-def _count_indices(values: Iterable[Any], n: int) -> int:
-    """Count the different integers from 0 to n - 1 among values."""
-    return sum(type(value) is int and 0 <= value < n for value in {*values})
 
 
 def _check_numbers(thing: Any, **shapes: tuple[int, ...]) -> None:

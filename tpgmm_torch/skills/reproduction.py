@@ -180,14 +180,6 @@ def _run_together(
     ]
 
 
-def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
-    """Frames of B situations, (B,) or, if they move, (T, B)."""
-    return {
-        name: Frame.stack([situation.frames[name] for situation in situations])
-        for name in situations[0].frames
-    }
-
-
 def _over_time(estimates: Sequence[Estimate], shape: Sequence[int]) -> Estimate:
     """Estimates (T, B, ...) of T ticks."""
     return Estimate(
@@ -197,11 +189,18 @@ def _over_time(estimates: Sequence[Estimate], shape: Sequence[int]) -> Estimate:
     )
 
 
+def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
+    """Frames of B situations, (B,) or, if they move, (T, B)."""
+    return {
+        name: Frame.stack([situation.frames[name] for situation in situations])
+        for name in situations[0].frames
+    }
+
+
 def _row(candidates: Sequence[Candidate], row: int) -> tuple[Candidate, ...]:
     """Candidates of one robot of a batch."""
     return tuple(
-        Candidate(one.mean[:, row], one.covariance[:, row], one.share[:, row])
-        for one in candidates
+        Candidate(*(part[:, row] for part in vars(one).values())) for one in candidates
     )
 
 
@@ -221,14 +220,13 @@ def _candidates(
     parts = []
     for now in _stretches(holdings, size):
         estimate = Estimate(whole.joints[now], whole.covariance[now], activation[now])
-        holding = _together(holdings[now], _at(frames, now), joints.shape[1:2])
+        here = {n: f[now] if len(f.batch_shape) == 2 else f for n, f in frames.items()}
+        holding = _together(holdings[now], here, joints.shape[1:2])
         state = holding.state(skill.kinematics.state(joints[now]))
         at = time[now].unsqueeze(-1)
         parts.append(skill.candidates(at, state, holding.frames, estimate))
-    return [
-        Candidate(*(torch.cat(field) for field in zip(*map(_fields, over_time), strict=True)))
-        for over_time in zip(*parts, strict=True)
-    ]
+    several = [[vars(one).values() for one in own] for own in zip(*parts, strict=True)]
+    return [Candidate(*map(torch.cat, zip(*fields, strict=True))) for fields in several]
 
 
 def _stretches(holdings: Sequence[Holding], size: int) -> Iterator[slice]:
@@ -251,12 +249,3 @@ def _together(holdings: Sequence[Holding], frames: Frames, batch: Sequence[int])
             torch.stack([pose.orientation for pose in each]),
         )
     return replace(holdings[0], frames=places)
-
-
-def _at(frames: Frames, now: slice) -> dict[str, Frame]:
-    """Frames of shape (B,) or, if they move, (T, B) at some instants."""
-    return {name: f[now] if len(f.batch_shape) == 2 else f for name, f in frames.items()}
-
-
-def _fields(candidate: Candidate) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return candidate.mean, candidate.covariance, candidate.share

@@ -104,8 +104,7 @@ class Ways(CompositeSkill):
         for one in skills:
             if one.kinematics.joint_names != skills[0].kinematics.joint_names:
                 raise DataError("the ways are of different robots")
-        for name, value in (("skills", skills), ("weights", weights), ("limits", limits)):
-            object.__setattr__(self, name, value)
+        vars(self).update(skills=skills, weights=weights, limits=limits)
 
     @property
     def summary(self) -> TrainingSummary | None:

@@ -309,7 +309,9 @@ def _divide_along(
     if not best:
         return None
     labels, gain = partitions[best], float(scores[best] - scores[0])
-    apart = _separation(along, labels, view.near)
+    means, squares = _scatter(along, labels)
+    within = max(math.sqrt(squares / (len(along) - len(means))), view.near)
+    apart = float(np.diff(np.sort(means)).min() / within)
     return _Split(labels, bic, float(bic[best] - bic[0]), gain, apart, view, stretch)
 
 
@@ -375,13 +377,6 @@ def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> flo
     log_density = -0.5 * (free * math.log(2 * math.pi * variance) + squares / variance)
     log_means = -0.5 * float(np.log(sizes).sum()) - len(means) * math.log(wide)
     return log_density + log_means + float((sizes * np.log(sizes / n)).sum())
-
-
-def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Smallest distance of two modes' means, in standard deviations within them."""
-    means, squares = _scatter(values, labels)
-    within = max(math.sqrt(squares / (len(values) - len(means))), near)
-    return float(np.diff(np.sort(means)).min() / within)
 
 
 def _is_situation(split: _Split, views: Sequence[_View]) -> bool:
