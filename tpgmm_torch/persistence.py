@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import FunctionType, MethodType, UnionType
+from types import FunctionType, MappingProxyType, MethodType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -313,7 +313,8 @@ def _list_arguments(thing: Any) -> dict[str, Any]:
 def decode(
     description: Any,
     custom: abc.Sequence[type] = (),
-    tensors: Mapping[str, Tensor] | None = None,
+    tensors: Mapping[str, Tensor] = MappingProxyType({}),
+    entry: str = "model",
 ) -> Any:
     """Make a model or a part of it again, the inverse of :func:`encode`.
 
@@ -325,19 +326,14 @@ def decode(
         User-defined classes that may occur; no other code is ever looked up.
     tensors : mapping of str to Tensor, optional
         Those that were described, on the device where they are wanted.
+    entry : str, default="model"
+        How errors name it.
 
     Raises
     ------
     ModelFileError
         If a class is not known or does not take these fields.
     """
-    return _decode(description, "model", custom, tensors or {})
-
-
-def _decode(
-    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
-) -> Any:
-    """Decode an entry; errors name it."""
     try:
         return _read_entry(description, entry, custom, tensors)
     except ModelFileError:
@@ -352,7 +348,7 @@ def _read_entry(
 ) -> Any:
     if isinstance(description, list):
         pairs = enumerate(description)
-        return tuple(_decode(one, f"{entry}.{k}", custom, tensors) for k, one in pairs)
+        return tuple(decode(one, custom, tensors, f"{entry}.{k}") for k, one in pairs)
     if not isinstance(description, Mapping):
         return description
     if "float" in description:
@@ -362,7 +358,7 @@ def _read_entry(
     if "config" in description:  # of a class, which reads it itself
         return _rebuild(dict(description), custom)
     fields = description.get("mapping", description).items()
-    given = {key: _decode(one, f"{entry}.{key}", custom, tensors) for key, one in fields}
+    given = {key: decode(one, custom, tensors, f"{entry}.{key}") for key, one in fields}
     return given if "mapping" in description else _rebuild(given, custom)
 
 
