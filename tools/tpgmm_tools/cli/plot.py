@@ -100,18 +100,23 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
 
 
 def _leaf_names(operator: Any, kinematics: Kinematics) -> list[str]:
-    """Label joints, metres, forces, parts of turns, and number all else."""
-    names, count = kinematics.joint_names, operator.dimension(kinematics)
+    """Label joints and forces, and leave all else to those of poses."""
+    names, link = kinematics.joint_names, (*operator.links(), "")[0]
     if operator.is_posture:
         return [names[column] for column in operator.columns(names)]
-    link = operator.links()[0] if operator.links() else ""
-    if not operator.constrains_joints:
-        forces = [f"{link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
-        return [*forces, f"{link}\ncontact"]
+    if operator.constrains_joints:
+        return _pose_names(operator, kinematics, link)
+    forces = [f"{link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+    return [*forces, f"{link}\ncontact"]
+
+
+def _pose_names(operator: Operator, kinematics: Kinematics, link: str) -> list[str]:
+    """Label metres, parts of rotation vectors and of quaternions, and number all else."""
+    count = operator.dimension(kinematics)
     if operator.units(kinematics) == ("m",) * 3:
         return [f"{link}\n{axis} [m]" for axis in "xyz"]
-    if operator.rotation_vector_starts(kinematics) == (0,) and count == 3:
+    if count == 3 and operator.rotation_vector_starts(kinematics) == (0,):
         return [f"{link}\nrotation {axis} [rad]" for axis in "xyz"]
-    if operator.quaternion_starts(kinematics) == (0,) and count == 4:
+    if count == 4 and operator.quaternion_starts(kinematics) == (0,):
         return [f"{link}\nq{part}" for part in "wxyz"]
     return [f"coordinate {i + 1}" for i in range(count)]
