@@ -71,7 +71,7 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
+from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.robots.kinematics import JointSpace
@@ -733,7 +733,9 @@ def test_samples_are_those_of_their_random_state_and_as_smooth_as_the_model():
 
 def test_bounds_of_a_motion_follow_what_was_demonstrated():
     model = bottle()
-    acceleration, jerk = demonstrated_peaks(bottle_demonstrations(), upper_body().joint_names)
+    acceleration, jerk = typical_peaks(
+        [joint_peaks(d.reorder(upper_body().joint_names)) for d in bottle_demonstrations()]
+    )
     assert torch.equal(model.skill.peaks[0], acceleration) and torch.equal(
         model.skill.peaks[1], jerk
     )

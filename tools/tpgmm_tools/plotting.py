@@ -149,27 +149,30 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
     operator, kinematics : Operator, Kinematics
         Whose coordinates, for which robot.
     """
-    match operator:
-        case kinds.Stack():
-            return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
-        case kinds.Canonical():
-            names = kinematics.joint_names
-            return [names[column] for column in operator.columns(names)]
-        case kinds.AbsolutePosition() | kinds.RelativePosition():
-            return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
-    return _other_names(operator, kinematics)
+    return [name for one in operator.leaves for name in _leaf_names(one, kinematics)]
 
 
-def _other_names(operator: Any, kinematics: Kinematics) -> list[str]:
-    """Label forces, parts of rotation vectors and quaternions, and number all else."""
-    if isinstance(operator, kinds.Wrench):
-        forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
-        return [*forces, f"{operator.link}\ncontact"]
-    if operator.rotation_vector_starts(kinematics) == (0,):
-        return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
-    if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):
-        return [f"{operator.link}\nq{part}" for part in "wxyz"]
-    return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]
+def _leaf_names(operator: Any, kinematics: Kinematics) -> list[str]:
+    """Label joints and forces, and leave all else to those of poses."""
+    names, link = kinematics.joint_names, (*operator.links(), "")[0]
+    if operator.is_posture:
+        return [names[column] for column in operator.columns(names)]
+    if operator.constrains_joints:
+        return _pose_names(operator, kinematics, link)
+    forces = [f"{link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+    return [*forces, f"{link}\ncontact"]
+
+
+def _pose_names(operator: Operator, kinematics: Kinematics, link: str) -> list[str]:
+    """Label metres, parts of rotation vectors and of quaternions, and number all else."""
+    count = operator.dimension(kinematics)
+    if operator.units(kinematics) == ("m",) * 3:
+        return [f"{link}\n{axis} [m]" for axis in "xyz"]
+    if count == 3 and operator.rotation_vector_starts(kinematics) == (0,):
+        return [f"{link}\nrotation {axis} [rad]" for axis in "xyz"]
+    if count == 4 and operator.quaternion_starts(kinematics) == (0,):
+        return [f"{link}\nq{part}" for part in "wxyz"]
+    return [f"coordinate {i + 1}" for i in range(count)]
 
 
 def legend(drawing: Figure) -> None:

@@ -9,7 +9,7 @@ one selection of rows their Jacobians: a control tick costs per operation, not p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.operators.base import Linearization, Operator
@@ -80,7 +80,7 @@ class PoseOperator(Operator):
         """Check that :func:`linearize_poses` serves."""
         return True
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """Return the row of eq. (6) for a position, of eq. (11) for an orientation.
 
         ``J (q - q_{t-1}) = R mu + p - x_{t-1}``, and
@@ -91,9 +91,7 @@ class PoseOperator(Operator):
         """
         return linearize_poses((self,), state, frames)
 
-    def poses(
-        self, state: RobotState, frames: Mapping[str, Frame]
-    ) -> tuple[Frame, Frame | None]:
+    def poses(self, state: RobotState, frames: Frames) -> tuple[Frame, Frame | None]:
         """Return the poses of what is seen and of what it is seen from, None for the base."""
         body = (
             state.pose(self.link)
@@ -106,7 +104,7 @@ class PoseOperator(Operator):
         return body, state.pose(moving) if moving else _place(self._frame, state, frames)
 
 
-def _place(name: str, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
+def _place(name: str, state: RobotState, frames: Frames) -> Frame:
     if name not in frames:
         known = [*frames, *state.links]
         raise UnknownNameError("frame", name, "the situation or the robot's links", known)
@@ -123,7 +121,7 @@ class _Term(NamedTuple):
 
 
 def linearize_poses(
-    operators: Iterable[PoseOperator], state: RobotState, frames: Mapping[str, Frame]
+    operators: Iterable[PoseOperator], state: RobotState, frames: Frames
 ) -> Linearization:
     """``J``, ``M``, ``c`` and the present quaternions of operators that are stacked.
 

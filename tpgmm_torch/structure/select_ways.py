@@ -20,6 +20,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.ways import Ways
 from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
@@ -201,7 +202,7 @@ class SelectWays(DemonstrationEstimator):
         shown = [[one for k, one in pairs if k == way] for way in range(self.n_ways_)]
         self.models_ = [clone(self.model).fit(own) for own in shown]
         self.skill_: Ways | Regression = self.models_[0].skill
-        self.best_model_: Any = self.models_[0]
+        self.best_model_: TaskParameterizedGMM | Skill = self.models_[0]
         if self.n_ways_ > 1:
             skills = tuple(model.skill for model in self.models_)
             limits = tuple(map(_largest_surprise, skills, shown))
@@ -308,7 +309,9 @@ def _divide_along(
     if not best:
         return None
     labels, gain = partitions[best], float(scores[best] - scores[0])
-    apart = _separation(along, labels, view.near)
+    means, squares = _scatter(along, labels)
+    within = max(math.sqrt(squares / (len(along) - len(means))), view.near)
+    apart = float(np.diff(np.sort(means)).min() / within)
     return _Split(labels, bic, float(bic[best] - bic[0]), gain, apart, view, stretch)
 
 
@@ -374,13 +377,6 @@ def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> flo
     log_density = -0.5 * (free * math.log(2 * math.pi * variance) + squares / variance)
     log_means = -0.5 * float(np.log(sizes).sum()) - len(means) * math.log(wide)
     return log_density + log_means + float((sizes * np.log(sizes / n)).sum())
-
-
-def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Smallest distance of two modes' means, in standard deviations within them."""
-    means, squares = _scatter(values, labels)
-    within = max(math.sqrt(squares / (len(values) - len(means))), near)
-    return float(np.diff(np.sort(means)).min() / within)
 
 
 def _is_situation(split: _Split, views: Sequence[_View]) -> bool:

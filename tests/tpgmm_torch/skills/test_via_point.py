@@ -4,7 +4,7 @@ import pytest
 
 from tests.support.refusals import refused
 from tests.support.skills import small_bottle
-from tpgmm_torch import Frame, ViaPoints
+from tpgmm_torch import Canonical, Frame, ViaPoints
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.skills.via_point import ViaPoint
 
@@ -36,9 +36,9 @@ def test_a_frame_is_a_pose():
 
 def test_some_joints_go_by_name():
     kinematics = small_bottle().kinematics_
-    wanted, asked = ViaPoint(1.0, "canonical", {"l_elbow": 0.4}).coordinates(kinematics)
-    assert asked == [kinematics.joint_names.index("l_elbow")]
-    assert float(wanted[asked]) == 0.4
+    point = ViaPoint(1.0, "canonical", {"r_elbow": 0.1, "l_elbow": 0.4})
+    assert point.coordinates(kinematics).tolist() == [0.4, 0.1]  # as the robot has them
+    assert point.operator == Canonical(joints=("r_elbow", "l_elbow"))
 
 
 @pytest.mark.parametrize(("arguments", "error", "message"), [

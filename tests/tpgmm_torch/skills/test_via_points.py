@@ -16,8 +16,8 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.operators.text import parse_operator
-from tpgmm_torch.skills.conditioning import covariance_between, wendland
 from tpgmm_torch.skills.via_point import ViaPoint
+from tpgmm_torch.skills.via_points import covariance_between, wendland
 
 GRID = torch.linspace(0, 5, 251, dtype=torch.float64)
 
