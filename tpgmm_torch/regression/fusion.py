@@ -14,14 +14,14 @@ there are joints, no pseudo-inverse and no epsilon.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
 from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.operators.stack import POSE_OPERATORS
@@ -133,11 +133,7 @@ class KalmanUpdate:
         return all(type(leaf) in POSE_OPERATORS for leaf in leaves(tasks))
 
     def __call__(
-        self,
-        conditionals: Conditionals,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, conditionals: Conditionals, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor]:
         """Fused estimates of the joints by A components, in terms of the step ``q - q_{t-1}``.
 

@@ -9,7 +9,7 @@ mix the components.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
@@ -164,7 +164,7 @@ class Regression:
         self,
         time: Tensor,
         state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
+        frames: Frames,
         bounds: tuple[Tensor, Tensor] | None = None,
         *,
         candidates: bool = False,
@@ -191,11 +191,7 @@ class Regression:
         return found
 
     def fuse(
-        self,
-        components: Components,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, components: Components, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Eqs (1), (2) and regression: the mixture of some components, fused, given time.
 
@@ -246,11 +242,7 @@ class Regression:
         return tuple(found)
 
     def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
+        self, times: Tensor, state: RobotState, frames: Frames, window: slice = slice(None)
     ) -> Tensor:
         """Log-density of observed robots at times; see :meth:`Skill.log_likelihood`."""
         key = times.numpy(force=True).tobytes()
@@ -300,7 +292,7 @@ class Regression:
         seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
         return Stack(*seen), one.marginal(columns)
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
+    def start(self, joints: Tensor, frames: Frames) -> Regression:
         """Return the same for all robots; see :meth:`Skill.start`."""
         return self
 
@@ -347,7 +339,7 @@ class Regression:
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
-    def surprise(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+    def surprise(self, time: Tensor, joints: Tensor, frames: Frames) -> Tensor:
         """Compute how much less likely local coordinates are than those expected [nats].
 
         Parameters
@@ -374,7 +366,7 @@ class Regression:
         return (most - self.log_density(times, local, self.n_samples)).reshape(batch)
 
     def candidates(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+        self, time: Tensor, state: RobotState, frames: Frames, estimate: Estimate
     ) -> tuple[Candidate, ...]:
         """Eq. (1) for each operator of joints, mixed over the components, and its share.
 
@@ -566,18 +558,14 @@ class Regression:
         return state if isinstance(state, RobotState) else self.kinematics.state(state)
 
     def _estimate_together(
-        self, time: Tensor, state: Tensor | RobotState, frames: Mapping[str, Frame]
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
     ) -> Estimate:
         components = self._components_at(time)
         joints, covariance, weights = self.fuse(components, time, self._state(state), frames)
         return Estimate(joints, covariance, weights @ components.places)
 
     def _in_parts(
-        self,
-        batch: torch.Size,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
+        self, batch: torch.Size, time: Tensor, state: Tensor | RobotState, frames: Frames
     ) -> Estimate:
         """Estimate many robots part by part, those together that are at about the same time."""
         if isinstance(state, RobotState):
@@ -610,7 +598,7 @@ class Regression:
         conditionals: Sequence[Conditionals],
         time: Tensor,
         state: RobotState,
-        frames: Mapping[str, Frame],
+        frames: Frames,
     ) -> Iterator[tuple[Linearization, Tensor, Tensor, Tensor]]:
         """Each operator here, and means, time derivatives and covariances of components.
 
@@ -628,11 +616,7 @@ class Regression:
             yield operator.linearize(state, frames), mean, gain, covariance
 
     def _sum(
-        self,
-        components: Components,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, components: Components, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Sums of the operators' information, in terms of the step ``q - q_{t-1}``."""
         terms = []
