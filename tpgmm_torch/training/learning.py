@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -31,7 +31,8 @@ from tpgmm_torch.training.mixture_settings import (
     regularization,
 )
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
-from tpgmm_torch.training.training_rows import TrainingRows, batches_of, check_alike, read_rows
+from tpgmm_torch.training.shares import Share
+from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 #: Parameters of the estimator that are the mixture's too.
 SHARED = (
@@ -100,25 +101,19 @@ def learn(
         If demonstrations do not fit together, or with the robot and the operators, or cannot
         be what they are taken for.
     """
-    operators, batches = check_operators(settings["operators"]), batches_of(X)
-    head = next(batches, [])
-    check_alike(head, processes)
+    operators, share = check_operators(settings["operators"]), Share(X, processes)
     where = settings["dtype"], settings["device"]
-    kinematics = kinematics_for(head, operators, settings["robot"], *where)
+    kinematics = kinematics_for(share.first, operators, settings["robot"], *where)
     if settings["fusion"] is not None:
         settings["fusion"].check(of_joints(operators), kinematics)
     read: list[tuple[EpisodeSummary, Array]] = []
 
-    def summarize_batches() -> Iterator[Sequence[Demonstration]]:
-        for batch in chain([head], batches):
-            peaks = [joint_peaks(one.reorder(kinematics.joint_names)) for one in batch]
-            read.extend(zip(summarize(batch, kinematics), peaks, strict=True))
-            yield batch
+    def watch(one: Demonstration) -> None:
+        peaks = joint_peaks(one.reorder(kinematics.joint_names))
+        read.extend((summary, peaks) for summary in summarize([one], kinematics))
 
-    rows = read_rows(
-        summarize_batches(), operators, kinematics,
-        responsibilities=settings["responsibilities"], processes=processes,
-    )  # fmt: skip
+    shared = settings["responsibilities"]
+    rows = read_rows(share, operators, kinematics, responsibilities=shared, watch=watch)
     rows = rows if interval is None else rows.within(*interval)
     episodes, peaks = zip(*chain.from_iterable(processes.gather(read)), strict=True)
     _report(rows, episodes, kinematics, settings)

@@ -25,6 +25,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import attach_holds
 from tpgmm_torch.training.local_data import at_phases
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.shares import Share
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 __all__ = ["drop_outliers"]
@@ -99,7 +100,7 @@ def outlying_demonstrations(
     """
     if len(demonstrations) < FEWEST:  # nothing is read
         return ()
-    rows = read_rows([demonstrations], operators, kinematics)
+    rows = read_rows(Share(demonstrations), operators, kinematics)
     return outlying_rows(rows, kinematics, threshold=threshold, duration=duration)
 
 
