@@ -257,7 +257,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         if processes.count > 1 and not isinstance(seed, Integral):
             seed = processes.gather(check_random_state(seed).randint(2**31))[0]
         rng = check_random_state(seed)
-        starts = self._starts(start, points, family, shift, scale, rng)
+        starts = self._starts(start, points, family, rng)
         fits = [
             em.expectation_maximization(
                 begin, points, family, RandomState(rng.randint(2**31 - 1)),
@@ -277,8 +277,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         start: BlockGaussianMixture | None,
         points: Points,
         family: em.CovarianceFamily,
-        shift: Tensor,
-        scale: Tensor,
         rng: RandomState,
     ) -> list[em.Parameters]:
         """Choose where EM begins, in standardised units."""
@@ -291,7 +289,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 f"the start has {given[0]} components in blocks of {given[1]} columns, "
                 f"asked for are {self.n_components} in blocks of {points.widths}"
             )
-        return [family.admit(start._parameters().affine(1 / scale, -shift / scale))]
+        standard = 1 / points.scale, -points.shift / points.scale
+        return [family.admit(start._parameters().affine(*standard))]
 
     def _rows(self, X: Any) -> Rows:
         """Check the rows of X."""

@@ -180,14 +180,10 @@ class PostureSearch:
             everyone[of_all] = joints
             return state_at(everyone)[of_all]
 
-        cost = PostureCost(
-            self,
-            estimate.activation.expand(*batch, -1)[where],
-            time.expand(batch)[where] if time.ndim else time,
-            begun,
-            {name: frame.expand(batch)[where] for name, frame in frames.items()},
-            state,
-        )
+        weights = estimate.activation.expand(*batch, -1)[where]
+        now = time.expand(batch)[where] if time.ndim else time
+        here = {name: frame.expand(batch)[where] for name, frame in frames.items()}
+        cost = PostureCost(self, weights, now, begun, here, state)
         # elsewhere or, within reach, a step from where the robot stands
         look, begins = age // LOOK, (age < LOOK) | (age % LOOK == 0)
         if bool(begins.any()):

@@ -204,12 +204,12 @@ class Regression:
             steps, covariances = self._update(stacked, time, state, frames)
             log_h = self._log_activation(components, time)
         else:
-            precision, vector, square = self._sum(components, time, state, frames)
-            steps, covariances = gaussians.from_information(precision, vector[..., 0])
+            sums = self._sum(components, time, state, frames)
+            steps, covariances = gaussians.from_information(sums[0], sums[1][..., 0])
             if self.fusion.activation == "time":
                 log_h = self._log_activation(components, time)
             else:
-                log_h = self._product_activation(components, time, precision, vector, square)
+                log_h = self._product_activation(components, time, sums)
         weights = torch.softmax(log_h, -1)
         step, covariance = gaussians.moment_match(weights, steps, covariances)
         return state.joints + step, covariance, weights
@@ -523,18 +523,14 @@ class Regression:
         return log_h
 
     def _product_activation(
-        self,
-        components: Components,
-        time: Tensor,
-        precision: Tensor,
-        vector: Tensor,
-        square: Tensor,
+        self, components: Components, time: Tensor, sums: tuple[Tensor, Tensor, Tensor]
     ) -> Tensor:
         """``log h_i(t)``, up to a constant, from the time marginal of the product (2).
 
         Integrating the joints out of the product leaves a quadratic in the time t + delta:
         the operators' time marginals plus how much they disagree about the joints.
         """
+        precision, vector, square = sums
         white = gaussians.whiten(precision, vector, "the precision of the product")
         disagreement = square - white.mT @ white
         slope, curvature = disagreement[..., 0, 1], disagreement[..., 1, 1]

@@ -24,12 +24,7 @@ from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.mixture_settings import (
-    block_widths,
-    check_operators,
-    kinematics_for,
-    regularization,
-)
+from tpgmm_torch.training import mixture_settings
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
 from tpgmm_torch.training.shares import Share
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
@@ -101,9 +96,10 @@ def learn(
         If demonstrations do not fit together, or with the robot and the operators, or cannot
         be what they are taken for.
     """
-    operators, share = check_operators(settings["operators"]), Share(X, processes)
+    operators = mixture_settings.check_operators(settings["operators"])
+    share, robot = Share(X, processes), settings["robot"]
     where = settings["dtype"], settings["device"]
-    kinematics = kinematics_for(share.first, operators, settings["robot"], *where)
+    kinematics = mixture_settings.kinematics_for(share.first, operators, robot, *where)
     if settings["fusion"] is not None:
         settings["fusion"].check(of_joints(operators), kinematics)
     read: list[tuple[EpisodeSummary, Array]] = []
@@ -122,19 +118,12 @@ def learn(
     mixture = BlockGaussianMixture(
         **_of_mixture(settings, rows.operators, kinematics),
         group_size=rows.group_size,
-        reg_covar=regularization(moments, rows.operators, kinematics, **shape),
+        reg_covar=mixture_settings.regularization(moments, rows.operators, kinematics, **shape),
     ).fit(rows.rows, processes=processes)
     _shrink(mixture, rows, kinematics, settings)
-    return Learned(
-        mixture,
-        rows.operators,
-        kinematics,
-        rows.time,
-        rows.holds,
-        rows.n_demonstrations,
-        typical_peaks(peaks),
-        TrainingSummary.of(episodes, kinematics),
-    )
+    shown = rows.operators, kinematics, rows.time, rows.holds, rows.n_demonstrations
+    summary = TrainingSummary.of(episodes, kinematics)
+    return Learned(mixture, *shown, typical_peaks(peaks), summary)
 
 
 def from_parameters(
@@ -168,7 +157,8 @@ def from_parameters(
     weights, time = as_tensor(weights, "weights"), as_tensor(time, "time")
     means = [as_tensor(mean, "a mean") for mean in means]
     covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
-    operators, robot = check_operators(settings["operators"]), settings["robot"]
+    operators = mixture_settings.check_operators(settings["operators"])
+    robot = settings["robot"]
     if robot is None:
         raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
     if settings["fusion"] is not None:
@@ -187,9 +177,8 @@ def _of_mixture(
     settings: Mapping[str, Any], operators: Sequence[Operator], kinematics: Kinematics
 ) -> dict[str, Any]:
     """Collect parameters of the mixture of the local data of all operators."""
-    return {name: settings[name] for name in SHARED} | {
-        "blocks": block_widths(operators, kinematics)
-    }
+    blocks = mixture_settings.block_widths(operators, kinematics)
+    return {name: settings[name] for name in SHARED} | {"blocks": blocks}
 
 
 def _shrink(

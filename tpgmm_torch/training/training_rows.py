@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
@@ -25,14 +26,8 @@ from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training import local_data
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import (
-    Motion,
-    at_phases,
-    constant_columns,
-    like,
-    match_rows,
-)
 from tpgmm_torch.training.mixture_settings import block_widths
 from tpgmm_torch.training.operator_completion import with_force_axes, with_mean_orientations
 from tpgmm_torch.training.shares import Share
@@ -86,8 +81,8 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        episodes = (self.stored[start:stop] for start, stop in pairwise(self.edges))
-        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in episodes])
+        episodes = (torch.from_numpy(self.stored[i:j]) for i, j in pairwise(self.edges))
+        thinned = torch.stack([local_data.at_phases(rows, count) for rows in episodes])
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
@@ -142,20 +137,20 @@ def read_rows(
     """
     processes = share.processes
     holds = processes.gather(demonstrated_holds(share.first, operators, kinematics))[0]
-    motions = [Motion.of(one, kinematics, holds) for one in share.first]
+    motions = [local_data.Motion.of(one, kinematics, holds) for one in share.first]
     completed = with_mean_orientations(with_force_axes(operators, motions), motions, kinematics)
     operators = processes.gather(completed)[0]
-    later = ((one, Motion.of(one, kinematics, holds)) for one in share.read_rest())
+    later = ((one, local_data.Motion.of(one, kinematics, holds)) for one in share.read_rest())
     pairs = chain(zip(share.first, motions, strict=True), later)
     seen = ((d, m, [m.coordinates(one, kinematics) for one in operators]) for d, m in pairs)
     first = next(seen)
     shown = processes.gather([block.cpu() for block in first[-1]])[0]
-    side = like([block.to(kinematics.lower) for block in shown])
+    side = local_data.like([block.to(kinematics.lower) for block in shown])
     stored: Any = [] if share.in_memory else RowFile()
     lengths = [0]
     for demonstration, motion, blocks in chain([first], seen):
         watch(demonstration)
-        rows = match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
+        rows = local_data.match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
         lengths.append(len(rows))
         stored.append(rows)
     stored, edges = np.concatenate(stored) if share.in_memory else stored, np.cumsum(lengths)
@@ -164,7 +159,7 @@ def read_rows(
     reference = processes.gather(stored[: edges[1]])[0]
     ends = (moments.smallest, moments.largest)
     low, high = (torch.from_numpy(x.astype(reference.dtype)) for x in ends)
-    constant = constant_columns(low, high, operators, kinematics).numpy()
+    constant = local_data.constant_columns(low, high, operators, kinematics).numpy()
     stored[:, constant] = reference[0, constant]
     reference = np.where(constant, reference[0], reference)
     time, number = _typical_time(stored, edges, processes)
@@ -231,11 +226,8 @@ def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
 
 
 def equivalent_rows(
-    rows: Rows,
-    reference: NDArray[np.float64],
-    widths: Sequence[int],
-    processes: Processes = ALONE,
-) -> tuple[NDArray[np.float64], int]:
+    rows: Rows, reference: Array, widths: Sequence[int], processes: Processes = ALONE
+) -> tuple[Array, int]:
     """Replace the demonstrations of all processes by rows, some per instant.
 
     Parameters
