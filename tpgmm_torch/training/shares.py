@@ -48,8 +48,7 @@ class Share:
 
     def read_rest(self) -> Iterator[Demonstration]:
         """Yield the demonstrations behind the first batch."""
-        second, self._second = self._second, []  # memory holds one batch at a time
-        yield from chain(second, chain.from_iterable(self._batches))
+        yield from chain(self._second, chain.from_iterable(self._batches))
 
     def _check_alike(self) -> None:
         """Refuse, in all processes, shares without demonstrations, or that differ."""
