@@ -46,8 +46,8 @@ def as_tensor(values: Any, name: str) -> Tensor:
         except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise DataError(f"{name} must be an array of numbers: {error}") from error
     # every tick asks: a sum is quickly had, and is not finite if a number is not
-    few = tensor.ndim == 1 and tensor.shape[0] <= FEW
-    total = sum(tensor.tolist()) if few else tensor.detach().sum().item()
+    few = tensor.numel() <= FEW
+    total = sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()
     if not math.isfinite(total):
         _check_finite(tensor, name)
     return tensor

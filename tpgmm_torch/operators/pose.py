@@ -191,11 +191,11 @@ class _Constants:
         seen, seen_from = ([pose(*one) for one in group] for group in (bodies, references))
         self.bodies = list(zip(seen, seen_from, strict=True))
         self.is_moving = min(seen_from) < len(links)
-        self.is_still = self.is_moving or max(seen) >= len(links)
+        self.is_still = any((self.is_moving, max(seen) >= len(links)))
         self.matrix, self.shape = _bilinear(terms, **options)
         unit = quaternions.identity(**options)
         base = Frame.from_checked(torch.zeros_like(unit[:3]), unit)
-        self.base = () if all(name for name, _ in references) else (base,)
+        self.base = [base] * (None in dict(references))  # if one refers to it
         self.seen, self.seen_from = index(seen), index(seen_from)
         angular = index(term.gain is not None for term in terms).long()
         self.first = torch.where(angular > 0, self.seen, self.seen_from)

@@ -157,8 +157,8 @@ def read_rows(
     # what varies by rounding alone becomes constant
     moments = ColumnMoments.of(stored, processes)
     reference = processes.gather(stored[: edges[1]])[0]
-    ends = (moments.smallest, moments.largest)
-    low, high = (torch.from_numpy(x.astype(reference.dtype)) for x in ends)
+    ends = np.stack((moments.smallest, moments.largest)).astype(reference.dtype)
+    low, high = torch.from_numpy(ends)
     constant = local_data.constant_columns(low, high, operators, kinematics).numpy()
     stored[:, constant] = reference[0, constant]
     reference = np.where(constant, reference[0], reference)
