@@ -143,8 +143,9 @@ class _Orientation(PoseOperator):
 
         Where a link's quaternion is part of the joint vector nothing has to be linearised.
         """
-        place = not self.links()[1:] and self.moving_reference(state) is None
-        return not self._tangent and not (place and state.quaternion_columns(self.link))
+        if self._tangent or state.quaternion_columns(self.link) is None:
+            return not self._tangent
+        return bool(self.links()[1:]) or self.moving_reference(state) is not None
 
     def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """See :meth:`PoseOperator.linearize`; exact in tangent space and for tracked poses.

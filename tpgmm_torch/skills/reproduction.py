@@ -6,6 +6,7 @@ Nothing is measured, and nothing bounds the references: a skill alone, and what 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
@@ -83,23 +84,25 @@ def open_loop(skill: Skill, start: Tensor, poses: Frames, grid: Sequence[float])
     here = _poses_at(0, poses, moving)
     holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, here)
     skill, joints, last = skill.start(start, here), start, None
-    done, inferring = list[Tick](), torch.is_inference_mode_enabled()
-    for k, now in enumerate(grid):
-        if now == last:
-            done.append(done[-1])
-            continue
-        seen = _poses_at(k, poses, moving) if moving else None
-        time = start.new_tensor(now)
-        # what the first step does not record, none does; to ask so takes a third
-        with torch.inference_mode(inferring or (k > 0 and not done[0][0].requires_grad)):
+    done = list[Tick]()
+    with ExitStack() as stack:
+        for k, now in enumerate(grid):
+            if now == last:
+                done.append(done[-1])
+                continue
+            seen = _poses_at(k, poses, moving) if moving else None
+            time = start.new_tensor(now)
             holding = holding.advance(time, joints, seen)
             state: Any = joints
             if holding.carries:
                 state = holding.state(skill.kinematics.state(joints))
             found = skill.estimate(time, state, holding.frames)
             skill, joints = skill.advance(found), skill.kinematics.retract(found.joints)
-        done.append((joints, found, holding))
-        last = now
+            done.append((joints, found, holding))
+            last = now
+            if k == 0 and not joints.requires_grad:
+                # what the first step does not record, none does; to ask so takes a third
+                stack.enter_context(torch.inference_mode())
     return done
 
 

@@ -25,6 +25,7 @@ from tpgmm_torch.skills.ways import Ways
 from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import comparable_coordinates
+from tpgmm_torch.training.shares import Share
 from tpgmm_torch.training.training_rows import read_rows
 
 __all__ = ["SelectWays"]
@@ -240,7 +241,7 @@ class SelectWays(DemonstrationEstimator):
     def _views(self, known: Sequence[Demonstration]) -> list[_View]:
         operators, robot = check_operators(self.model.operators), self.model.robot
         kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
-        rows = read_rows([known], operators, kinematics)
+        rows = read_rows(Share(known), operators, kinematics)
         self._time = as_array(rows.time)
         data = rows.at_phases(len(rows.time))
         return [
