@@ -4,23 +4,24 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-__all__ = ["answer", "ask", "peak_memory", "reset_peak"]
+__all__ = ["ask", "peak_memory", "reset_peak"]
 
 ROOT = Path(__file__).parents[1]
 
 
 def ask(module: str, *arguments: object, launcher: tuple[str, ...] = ()) -> Any:
-    """Run a module of this folder as a program; return what it gave to :func:`answer`.
+    """Let a new process call ``answer`` of a module of this folder; return what that returns.
 
     Parameters
     ----------
     module : str
         Its name, without the package.
     *arguments
-        Of its command line.
+        Of the function, as JSON holds them.
     launcher : sequence of str
         What stands between the interpreter and the module.
 
@@ -29,9 +30,9 @@ def ask(module: str, *arguments: object, launcher: tuple[str, ...] = ()) -> Any:
     RuntimeError
         If it fails; with what it printed.
     """
-    command = [sys.executable, *launcher, "-m", f"benchmarks.{module}"]
+    command = [sys.executable, *launcher, "-m", "benchmarks.child", module]
     done = subprocess.run(
-        [*command, *map(str, arguments)],
+        [*command, json.dumps(arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,
@@ -41,11 +42,6 @@ def ask(module: str, *arguments: object, launcher: tuple[str, ...] = ()) -> Any:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def answer(value: object) -> None:
-    """Say the result to the process that asked."""
-    print(json.dumps(value), flush=True)
 
 
 def reset_peak() -> None:
@@ -64,3 +60,9 @@ def peak_memory() -> float:
     status = Path("/proc/self/status").read_text(encoding="ascii")
     [line] = [line for line in status.splitlines() if line.startswith("VmHWM:")]
     return 1024.0 * int(line.split()[1])
+
+
+if __name__ == "__main__":
+    found = import_module(f"benchmarks.{sys.argv[1]}").answer(*json.loads(sys.argv[2]))
+    if found is not None:
+        print(json.dumps(found), flush=True)

@@ -18,7 +18,6 @@ import torch
 from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
 from benchmarks.skill import fit_model, skill
-from benchmarks.timing import in_turns, medians, seconds
 from tpgmm_control import Controller
 from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.skills.compiled import export_estimate
@@ -68,13 +67,12 @@ def begin_controller(
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Measure ticks of the skill from start to end in turns, and whole skills."""
+    """Measure ticks of the skill from start to end, in turns."""
     model, ticks = fit_model(settings), settings.size(5_000, 30)
     [situation] = skill(settings).situations(1, settings.seed + 1000)
     dt, length = float(model.time_.diff().median()), len(model.time_)
 
-    plain = partial(begin_plain, model, situation)
-    ways: dict[str, Callable[[], Step]] = {PLAIN: plain}
+    ways: dict[str, Callable[[], Step]] = {PLAIN: partial(begin_plain, model, situation)}
     asked: dict[str, Asked | None] = {PLAIN: None}
     for name, (options, most) in CONTROLLERS.items():
         ways[name] = partial(begin_controller, model, situation, dt, options)
@@ -90,34 +88,8 @@ def measure(settings: Settings) -> Iterator[Row]:
         middle, worst = np.percentile(each, [50, 99]).tolist()
         beside = ("", None) if name == PLAIN else (PLAIN, base)
         work, limit = f"tick, {WORK}, {name}", settings.target("most", 1.0)
-        yield Row(
-            f"{work}: median",
-            "ms",
-            middle,
-            *beside,
-            asked=asked[name],
-            rounds=ticks,
-        )
+        yield Row(f"{work}: median", "ms", middle, *beside, asked[name], rounds=ticks)
         yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
-
-    def whole(begin: Callable[[], Step]) -> float:
-        def run() -> None:
-            step = begin()
-            for _ in range(length - 1):
-                step(dt)
-
-        with torch.inference_mode():
-            return seconds(run)
-
-    runs = {
-        PLAIN: partial(whole, plain),
-        "predict": partial(seconds, partial(model.predict, [situation], candidates=False)),
-    }
-    found = medians(in_turns(runs, settings.rounds(5), warm_up=settings.full))
-    # 0.65 s where a step takes 0.36 ms
-    most = Asked("times", 0.65 / (1482 * 0.36e-3)) if settings.full else None
-    work, name = f"one situation, {length} ticks, predict", f"{PLAIN} as often"
-    yield Row(work, "s", found["predict"], name, found[PLAIN], asked=most)
 
 
 def _latencies(

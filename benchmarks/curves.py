@@ -3,14 +3,14 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
+import pandas as pd
 
 from benchmarks import mixtures
-from benchmarks.batched_step import tick
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
 from benchmarks.skill import fit_model
+from benchmarks.steps import tick
 from benchmarks.timing import in_turns, medians, per_call, per_iteration
 
 __all__ = ["measure"]
@@ -50,7 +50,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         [taken] = medians(in_turns(measurements, rounds, warm_up=True)).values()
         return {"ours": 1e6 * taken / n_robots}
 
-    two = (WIDTH, WIDTH)
+    two, most = (WIDTH, WIDTH), None if settings.full else 2
     k, at, width = f"K = {components}", f"N = {usual}", f"D = 2 x {WIDTH}"
     curves = [
         _Curve(f"points N ({k}, {width})", POINTS, EM, lambda n: em(n, components, two)),
@@ -69,41 +69,33 @@ def measure(settings: Settings) -> Iterator[Row]:
         ),
         _Curve("robots in a batch", (1, 8, 64, 512, 4096), "step, per robot [us]", step),
     ]
-    costs = []
-    for curve in curves:
-        numbers = curve.numbers if settings.full else curve.numbers[:2]
-        costs.append({number: curve.cost(number) for number in numbers})
+    costs = [
+        pd.DataFrame({number: curve.cost(number) for number in curve.numbers[:most]}).T
+        for curve in curves
+    ]
     _draw(curves, costs, settings)
-    for curve, by_number in zip(curves, costs, strict=True):
-        for number, cost in by_number.items():
-            unit = curve.ylabel.partition("[")[2].rstrip("]")
-            theirs = cost.get("scikit-learn")
+    for curve, cost in zip(curves, costs, strict=True):
+        unit = curve.ylabel.partition("[")[2].rstrip("]")
+        for number, found in cost.iterrows():
+            theirs = found.get("scikit-learn")
             other = "" if theirs is None else "scikit-learn, full"
             work = f"{number} {curve.title}"
-            yield Row(work, unit, cost["ours"], other, theirs, rounds=rounds)
+            yield Row(work, unit, found["ours"], other, theirs, rounds=rounds)
 
 
-def _draw(
-    curves: Sequence[_Curve],
-    costs: Sequence[Mapping[int, Mapping[str, float]]],
-    settings: Settings,
-) -> None:
+def _draw(curves: Sequence[_Curve], costs: Sequence[pd.DataFrame], settings: Settings) -> None:
     import matplotlib as mpl
 
     mpl.use("agg")
-    from matplotlib import pyplot, ticker
+    from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(2, 3, figsize=(13, 7), layout="constrained")
-    for axis, curve, by_number in zip(axes.flat, curves, costs, strict=False):
-        for name in next(iter(by_number.values())):
-            values = [cost[name] for cost in by_number.values()]
-            axis.loglog(list(by_number), np.maximum(values, 1e-3), "o-", label=name)
-        axis.set(title=curve.title, ylabel=curve.ylabel)
-        axis.set_xticks(list(by_number), [f"{number:,}" for number in by_number], minor=False)
-        axis.xaxis.set_minor_locator(ticker.NullLocator())
-        axis.title.set_fontsize("small")
-        axis.legend(fontsize="small")
-        axis.grid(alpha=0.3)
+    for axis, curve, cost in zip(axes.flat, curves, costs, strict=False):
+        cost.clip(lower=1e-3).plot(ax=axis, style="o-", loglog=True, grid=True)
+        axis.set(ylabel=curve.ylabel)
+        axis.set_title(curve.title, fontsize="small")
+        axis.set_xticks(cost.index, [f"{number:,}" for number in cost.index])
+        axis.minorticks_off()
     axes.flat[-1].axis("off")
     figure.savefig(settings.out / "cost.png", dpi=110)
     pyplot.close(figure)

@@ -1,7 +1,6 @@
-"""EM on points that stay on disk, beside reading them; as a program, both in turns."""
+"""EM on points that stay on disk, beside reading them."""
 
 import shutil
-import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.child import answer, ask, peak_memory, reset_peak
+from benchmarks.child import ask, peak_memory, reset_peak
 from benchmarks.points import BLOCKS, Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
@@ -60,7 +59,7 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     folder = Path(tempfile.mkdtemp(prefix="points-", dir=settings.out))
     try:
         _write(folder, n_points // FILES, settings.seed)
-        found = ask("disk", folder.resolve(), n_components, rounds, settings.seed)
+        found = ask("disk", str(folder.resolve()), n_components, rounds, settings.seed)
     finally:
         shutil.rmtree(folder)
     note = "files in the system's cache, read once into another"
@@ -88,13 +87,14 @@ def _write(folder: Path, n_rows: int, seed: int) -> None:
         shutil.copyfile(first, folder / f"{index}.parquet")
 
 
-def _in_turns(folder: Path, n_components: int, rounds: int, seed: int) -> dict[str, object]:
+def answer(folder: str, n_components: int, rounds: int, seed: int) -> dict[str, object]:
+    """Measure a pass of EM, and reading alone, in turns."""
     try:
         reset_peak()
         peak_is_known = True
     except OSError:
         peak_is_known = False
-    batches = Batches(folder)
+    batches = Batches(Path(folder))
     start = Problem.of(motions(13_000, seed=seed), n_components).start
     settings = {"blocks": BLOCKS, "tol": 0.0, "dtype": "float32"}
 
@@ -110,7 +110,3 @@ def _in_turns(folder: Path, n_components: int, rounds: int, seed: int) -> dict[s
     measurements = {"pyarrow": lambda: seconds(read), "ours": per_iteration(fit, 1, 4)}
     taken = medians(in_turns(measurements, rounds))
     return {**taken, "peak": peak_memory() / 1e9 if peak_is_known else None}
-
-
-if __name__ == "__main__":
-    answer(_in_turns(Path(sys.argv[1]), *map(int, sys.argv[2:])))

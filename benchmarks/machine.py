@@ -12,16 +12,8 @@ import torch
 __all__ = ["cores_allowed", "machine"]
 
 PACKAGES = (
-    "tpgmm-torch",
-    "torch",
-    "numpy",
-    "scipy",
-    "scikit-learn",
-    "pomegranate",
-    "gmr",
-    "pin",
-    "pyarrow",
-    "pytorch-kinematics",
+    *("tpgmm-torch", "torch", "numpy", "scipy", "scikit-learn", "pomegranate", "gmr", "pin"),
+    *("pyarrow", "pytorch-kinematics"),
 )
 
 

@@ -1,19 +1,16 @@
 """Processor time of the main work alone, in turns: what ``make regressions`` compares."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from time import process_time
-from typing import Any
-
-import torch
 
 from benchmarks import mixtures
-from benchmarks.batched_step import tick
 from benchmarks.child import ask
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import align_demonstrations, fit_model, model, skill
+from benchmarks.skill import align_demonstrations, compile_estimate, fit_model, model, skill
+from benchmarks.steps import tick, tick_of_one
 from benchmarks.timing import (
     Measurement,
     Work,
@@ -23,7 +20,6 @@ from benchmarks.timing import (
     per_iteration,
     seconds,
 )
-from tpgmm_torch.skills.compiled import compile_skill
 
 __all__ = ["measure"]
 
@@ -41,9 +37,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     problem = Problem.of(motions(settings.size(13_000, 650), seed=settings.seed), 10)
     large = Problem.of(motions(settings.size(1_000_000, 1_300), seed=settings.seed), 10)
     many, calls = settings.size(4096, 8), settings.size(300, 3)
-    # at tiny sizes, what is asked is only whether it runs
-    backend = "inductor" if settings.full else "aot_eager"
-    compiled = compile_skill(made.skill, backend=backend).estimate
+    compiled = compile_estimate(settings, made)
     iterations = settings.iterations(2, 12), settings.iterations(1, 3)
     measurements = {
         "import tpgmm_torch": lambda: ask("start_up", "tpgmm_torch")[0],
@@ -51,8 +45,8 @@ def measure(settings: Settings) -> Iterator[Row]:
         "fit of the demo": _once(lambda: model(settings, 30).fit(shown)),
         "EM iteration, 13k points": _iteration(mixtures.ours(problem), *iterations[0]),
         "EM iteration, 1M points": _iteration(mixtures.ours(large), *iterations[1]),
-        "step, one robot": _call(_one_robot(settings, made.step), calls),
-        "step, one robot, compiled": _call(_one_robot(settings, compiled), calls),
+        "step, one robot": _call(tick_of_one(settings, made.step), calls),
+        "step, one robot, compiled": _call(tick_of_one(settings, compiled), calls),
         f"step, {many} robots": _call(tick(made, settings, many), 1),
         "predict, one situation": _once(partial(made.predict, given[:1], candidates=False)),
         f"predict, {len(given)} situations": _once(
@@ -68,17 +62,3 @@ def measure(settings: Settings) -> Iterator[Row]:
 
 def _once(work: Work) -> Measurement:
     return partial(seconds, work, process_time)
-
-
-def _one_robot(settings: Settings, step: Callable[..., Any]) -> Work:
-    """Make a tick of a robot that has caught up with the skill, 3 s after it began."""
-    [situation] = skill(settings).situations(1, settings.seed + 2000)
-    time, joints = torch.tensor(3.0, dtype=torch.float64), situation.joints
-    for _ in range(5):
-        joints = step(time, joints, situation.frames).joints
-
-    def work() -> object:
-        with torch.inference_mode():
-            return step(time, joints, situation.frames)
-
-    return work

@@ -1,11 +1,9 @@
-"""Memory of EM above that of the points; as a program, from imports on."""
+"""Memory of EM above that of the points."""
 
-import multiprocessing
-import sys
 from collections.abc import Iterator
 
 from benchmarks import mixtures
-from benchmarks.child import answer, ask, peak_memory, reset_peak
+from benchmarks.child import ask, peak_memory, reset_peak
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
@@ -24,12 +22,14 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     except OSError as error:
         yield Omitted(work, f"the peak of the memory cannot be read on this system: {error}")
         return
-    used = ask("memory", n_points, n_components, settings.seed)
+    used = {
+        name: ask("memory", name, n_points, n_components, settings.seed) for name in LIBRARIES
+    }
     asked = settings.target("most", 0.3)
     yield Row(work, "GB", used["ours"], "scikit-learn, full", used["scikit-learn"], asked)
 
 
-def _above(library: str, n_points: int, n_components: int, seed: int) -> float:
+def answer(library: str, n_points: int, n_components: int, seed: int) -> float:
     """Measure the memory that a fit takes beyond what is held before [GB]."""
     few = Problem.of(motions(1_300, seed=seed), n_components)
     LIBRARIES[library](few)(1)  # what is loaded and kept once, whatever the points
@@ -38,14 +38,3 @@ def _above(library: str, n_points: int, n_components: int, seed: int) -> float:
     before = peak_memory()
     fit(2)
     return (peak_memory() - before) / 1e9
-
-
-def _each(*sizes: int) -> dict[str, float]:
-    """Measure each library in a process that has done nothing but the imports."""
-    forked = multiprocessing.get_context("fork")
-    with forked.Pool(1, maxtasksperchild=1) as pool:
-        return {name: pool.apply(_above, (name, *sizes)) for name in LIBRARIES}
-
-
-if __name__ == "__main__":
-    answer(_each(*map(int, sys.argv[1:])))

@@ -113,19 +113,23 @@ def _draw(kind: str, rng: np.random.Generator) -> Drawn:
         skill = ViaPoints(skill, [ViaPoint(0.04 * at, f"position:{other}", target)])
     else:
         place = states.position(side)[at].numpy()
-        if kind == "table":
-            solids.append(_draw_table(rng, place))
-        else:
+        if kind != "table":
             if rng.random() < 0.4:
                 place = 0.5 * (place + _elbow(references[at], side))
-            solids.append(_draw_solid(kind, rng, place + rng.normal(0, 0.01, 3)))
+            place = place + rng.normal(0, 0.01, 3)
+        solids.append(_draw_solid(kind, rng, place))
     scene = Scene(robot, solids, visuals=True, allowed=()).allowing(demonstrations)
     start = situation.joints, situation.frames
     return Drawn(kind, skill, scene, closed + 0.5, None, *start)
 
 
 def _draw_solid(kind: str, rng: np.random.Generator, place: Any) -> Shape:
-    """Draw a ball or a box."""
+    """Draw a ball or a box, or a table beside a hand, which comes down from the side."""
+    if kind == "table":
+        x, y, z = place
+        edge = y + np.sign(y) * rng.uniform(-0.03, 0.03)
+        centre = [x, edge + np.sign(y) * 0.1, z - rng.uniform(-0.02, 0.02)]
+        return Shape.box("table", [0.25, 0.2, 0.02], centre)
     size = rng.uniform(0.02, 0.04)
     if kind == "ball":
         return Shape.sphere("ball", size, place)
@@ -133,14 +137,6 @@ def _draw_solid(kind: str, rng: np.random.Generator, place: Any) -> Shape:
     turn /= np.linalg.norm(turn)
     edges = 2 * rng.uniform(0.02, 0.04, 3)
     return Shape.box("box", edges, place, orientation=turn)
-
-
-def _draw_table(rng: np.random.Generator, place: Any) -> Shape:
-    """Draw a table beside a hand, which comes down to the bottle from the side."""
-    x, y, z = place
-    edge = y + np.sign(y) * rng.uniform(-0.03, 0.03)
-    centre = [x, edge + np.sign(y) * 0.1, z - rng.uniform(-0.02, 0.02)]
-    return Shape.box("table", [0.25, 0.2, 0.02], centre)
 
 
 def _draw_on_the_way_of_the_bottle(
@@ -199,12 +195,6 @@ def _distances(one: Drawn, references: Tensor) -> dict[tuple[str, str], Any]:
     return one.scene.distances(references, places, 0.05, state)
 
 
-def _deepest(distances: Mapping[tuple[str, str], Any]) -> tuple[float, str]:
-    """Find the least distance in a motion [m], and its pair."""
-    every = ((float(d.min()), " / ".join(pair)) for pair, d in distances.items())
-    return min(every, default=(np.inf, ""))
-
-
 def examine_scene(number: int, dt: float) -> dict[str, Any]:
     """Measure one scene: without obstacles, and with them."""
     warnings.simplefilter("ignore")
@@ -216,10 +206,6 @@ def examine_scene(number: int, dt: float) -> dict[str, Any]:
     kept = _run(*given, one.scene, dt, part, one.held, stop=one.end - 0.5)
     states = [one.skill.kinematics.state(run["references"][-1]) for run in (bare, kept)]
     off = (states[0].positions - states[1].positions).norm(dim=-1).max()
-    distances = {
-        name: _distances(one, run["references"])
-        for name, run in (("bare", bare), ("kept", kept))
-    }
     needed = dict(zip(one.scene.pairs, one.scene.needed, strict=True))
     turns = kept["references"].diff(n=2, dim=0).abs().max(1).values
     waiting = np.array([status == "waiting" for status, _ in kept["reasons"]][2:])
@@ -229,8 +215,11 @@ def examine_scene(number: int, dt: float) -> dict[str, Any]:
         speed = kept["references"].diff(n=order, dim=0) / dt**order
         shares.append(float((speed.abs() / getattr(bounds, name)).max()))
     found = {"number": number, "kind": one.kind, "dt": dt, "bounds": max(shares)}
+    distances = {}
     for name, run in (("bare", bare), ("kept", kept)):
-        distance, found[f"{name}_pair"] = _deepest(distances[name])
+        distances[name] = _distances(one, run["references"])
+        deepest = ((float(d.min()), " / ".join(pair)) for pair, d in distances[name].items())
+        distance, found[f"{name}_pair"] = min(deepest, default=(np.inf, ""))
         found[f"{name}_mm"] = 1e3 * distance
         found[f"{name}_ms"] = 1e3 * float(np.median(run["ticks"]))
     return found | {

@@ -1,6 +1,5 @@
-"""EM by two processes together, beside one of them alone; as a program, one of the two."""
+"""EM by two processes together, beside one of them alone."""
 
-import sys
 import warnings
 from collections.abc import Iterator
 from time import perf_counter, process_time
@@ -10,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import distributed
 
-from benchmarks.child import answer, ask
+from benchmarks.child import ask
 from benchmarks.machine import cores_allowed
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Omitted, Row
@@ -39,6 +38,15 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     note = "what is left when the other core is free: the row before needs two that are"
     work += ": processor time of the busier"
     yield Row(work, "s", busy, other, busy_alone, rounds=rounds, note=note)
+
+
+def answer(
+    n_points: int, n_components: int, rounds: int, seed: int
+) -> dict[str, list[float]] | None:
+    """Take seconds as one of the two processes; the first one tells them."""
+    with joined_processes() as joined:
+        found = _in_turns(joined, n_points, n_components, rounds, seed)
+        return found if joined.rank == 0 else None
 
 
 def _in_turns(
@@ -70,10 +78,3 @@ def _in_turns(
             found["one"].append(iteration(problem.points, ALONE))
         distributed.barrier()
     return {name: np.median(each, axis=0).tolist() for name, each in found.items() if each}
-
-
-if __name__ == "__main__":
-    with joined_processes() as joined:
-        figures = _in_turns(joined, *map(int, sys.argv[1:]))
-        if joined.rank == 0:
-            answer(figures)

@@ -104,14 +104,7 @@ class Omitted:
 
 
 HEADINGS = (
-    "work",
-    "ours",
-    "rounds",
-    "competitor",
-    "theirs",
-    "ratio",
-    "asked",
-    "reached",
+    *("work", "ours", "rounds", "competitor", "theirs", "ratio", "asked", "reached"),
     "of peak",
 )
 

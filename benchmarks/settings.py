@@ -7,21 +7,21 @@ from benchmarks.rows import Asked, Kind
 
 __all__ = ["CASES", "Settings"]
 
-#: Name on the command line -> module beside this file, whose ``measure(settings)`` yields rows.
+#: Name on the command line -> function of a module beside this file that yields rows.
 CASES = {
-    "import": "start_up",
-    "em-13k": "em_small",
-    "em-1m": "em_large",
-    "memory": "memory",
-    "disk": "disk",
-    "processes": "processes",
-    "kinematics": "kinematics",
-    "step": "control_step",
-    "controller": "controller_tick",
-    "batch": "batched_step",
-    "predict": "prediction",
-    "curves": "curves",
-    "main": "main_times",
+    "import": "start_up.measure",
+    "em-13k": "em.measure_small",
+    "em-1m": "em.measure_large",
+    "memory": "memory.measure",
+    "disk": "disk.measure",
+    "processes": "processes.measure",
+    "kinematics": "kinematics.measure",
+    "step": "steps.measure_one",
+    "controller": "controller_tick.measure",
+    "batch": "steps.measure_batch",
+    "predict": "steps.measure_whole",
+    "curves": "curves.measure",
+    "main": "main_times.measure",
 }
 
 

@@ -1,13 +1,23 @@
 """The paper's experiment as what is to be reproduced: two hands, 17 joints, K = 10, P = 2."""
 
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 from benchmarks.settings import Settings
 from tpgmm_datasets.bottle.skill import BottleShaking, bottle_operators
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.skills.compiled import compile_skill
 
-__all__ = ["COMPONENTS", "align_demonstrations", "fit_model", "model", "skill"]
+__all__ = [
+    "COMPONENTS",
+    "align_demonstrations",
+    "compile_estimate",
+    "fit_model",
+    "model",
+    "skill",
+]
 
 COMPONENTS = 10
 
@@ -39,3 +49,11 @@ def fit_model(
 ) -> TaskParameterizedGMM:
     """Fit the model, which is not to be changed."""
     return model(settings, n_components, dtype=dtype).fit(align_demonstrations(settings))
+
+
+def compile_estimate(
+    settings: Settings, fitted: TaskParameterizedGMM, n_robots: int = 1
+) -> Callable[..., Any]:
+    """Compile the step of a model; at tiny sizes, what is asked is only whether it runs."""
+    backend = "inductor" if settings.full else "aot_eager"
+    return compile_skill(fitted.skill, n_robots, backend).estimate

@@ -1,12 +1,11 @@
-"""Processor time of imports, in new interpreters; as a program, in this one."""
+"""Processor time of imports, in new interpreters."""
 
 import importlib
-import sys
 from collections.abc import Iterator
 from statistics import median
 from time import process_time
 
-from benchmarks.child import answer, ask
+from benchmarks.child import ask
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
 
@@ -38,11 +37,11 @@ def measure(settings: Settings) -> Iterator[Row]:
     yield Row(work, "s", whole, "import torch, sklearn.base", both, rounds=rounds)
 
 
-def _seconds(module: str) -> float:
-    began = process_time()
-    importlib.import_module(module)
-    return process_time() - began
-
-
-if __name__ == "__main__":
-    answer([_seconds(name) for name in sys.argv[1:]])
+def answer(*modules: str) -> list[float]:
+    """Import modules one after the other; return the seconds of each."""
+    taken = []
+    for module in modules:
+        began = process_time()
+        importlib.import_module(module)
+        taken.append(process_time() - began)
+    return taken

@@ -30,7 +30,8 @@ def run(names: Sequence[str], settings: Settings) -> None:
     for name in names:
         print(f"{name} ...", flush=True)
         began, busy = perf_counter(), _cpu_seconds()
-        measure = import_module(f"benchmarks.{CASES[name]}").measure
+        module, _, function = CASES[name].partition(".")
+        measure = getattr(import_module(f"benchmarks.{module}"), function)
         records = [found.record() for found in measure(settings)]
         report = {
             "case": name,

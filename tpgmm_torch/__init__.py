@@ -4,6 +4,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from tpgmm_torch.late import load_late
+
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
@@ -33,11 +35,11 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOMES = {
-    "data.demonstrations": ("Demonstration", "Situation"),
-    "estimator": ("TaskParameterizedGMM",),
-    "data.frames": ("Frame",),
-    "data.holds": ("Hold",),
-    "operators": (
+    ".data.demonstrations": ("Demonstration", "Situation"),
+    ".estimator": ("TaskParameterizedGMM",),
+    ".data.frames": ("Frame",),
+    ".data.holds": ("Hold",),
+    ".operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",
         "Canonical",
@@ -45,35 +47,30 @@ _HOMES = {
         "RelativePosition",
         "Stack",
     ),
-    "persistence": ("load", "save"),
-    "robots.robot": ("Robot",),
-    "skills.sequence": ("Sequence",),
-    "skills.via_points": ("ViaPoints",),
-    "skills.ways": ("Ways",),
-    "structure.select_components": ("SelectComponents",),
-    "structure.select_operators": ("SelectOperators",),
-    "data.trajectories": ("Trajectory",),
-    "training.hold_detection": ("attach_holds", "find_holds"),
+    ".persistence": ("load", "save"),
+    ".robots.robot": ("Robot",),
+    ".skills.sequence": ("Sequence",),
+    ".skills.via_points": ("ViaPoints",),
+    ".skills.ways": ("Ways",),
+    ".structure.select_components": ("SelectComponents",),
+    ".structure.select_operators": ("SelectOperators",),
+    ".data.trajectories": ("Trajectory",),
+    ".training.hold_detection": ("attach_holds", "find_holds"),
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
-__all__ = sorted(_HOME)
+__all__ = sorted(name for names in _HOMES.values() for name in names)
+_load, _list_names = load_late(globals(), _HOMES)
 
 
 def __getattr__(name: str) -> object:
-    """A public name, the version, or a module, loaded when it is first asked for."""
-    value: object
+    """Load a public name, the version, or a module, when it is first asked for."""
     if name == "__version__":
-        value = import_module("importlib.metadata").version("tpgmm-torch")
-    elif name in _HOME:
-        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-    elif not name.startswith("_") and find_spec(f"{__name__}.{name}"):
-        return import_module(f"{__name__}.{name}")
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
-    return value
+        version = import_module("importlib.metadata").version("tpgmm-torch")
+        return globals().setdefault(name, version)
+    if name in __all__ or name.startswith("_") or not find_spec(f"{__name__}.{name}"):
+        return _load(name)
+    return import_module(f"{__name__}.{name}")
 
 
 def __dir__() -> list[str]:
-    """Public names, whether or not they are loaded yet."""
-    return sorted({*globals(), *__all__, "__version__"})
+    """List public names, whether or not they are loaded yet."""
+    return sorted({*_list_names(), "__version__"})

@@ -12,7 +12,6 @@ in the table         fits
 a class              its instances
 ``None``             ``None``
 ``"array-like"``     whatever has elements, a text excepted
-``"boolean"``        ``True`` and ``False``, those of NumPy too
 ``"random_state"``   ``None``, a seed from 0 to 2**32 - 1, a ``numpy.random.RandomState``
 ==================== =======================================================================
 
@@ -141,7 +140,6 @@ NAMED: Mapping[str | None, tuple[Callable[[Any], bool], str]] = {
         ),
         "array-like",
     ),
-    "boolean": (lambda value: isinstance(value, BOOLEANS), "True or False"),
     "random_state": (
         lambda value: value is None or isinstance(value, RandomState) or value in SEED,
         "a seed, a RandomState",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.mixture.processes import ALONE, Processes
@@ -253,14 +253,13 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         DataError, ShapeError, UnknownNameError, PlausibilityError, NotFittedError
             If a situation does not fit the model, or cannot be what it is taken for.
         """
-        skill: Any = self.skill
-        return reproduce(skill, X, candidates=candidates)
+        return reproduce(self.skill, X, candidates=candidates)
 
     def step(
         self,
         time: float | Tensor,
         state: RobotState | Any,
-        frames: Mapping[str, Frame] | None = None,
+        frames: Frames | None = None,
         *,
         candidates: bool = False,
     ) -> Estimate:
@@ -332,8 +331,7 @@ class TaskParameterizedGMM(DemonstrationEstimator):
         DataError
             If ``n_samples`` is no positive integer, and as :meth:`predict` does.
         """
-        skill: Any = self.skill
-        return sample(skill, situation, n_samples, random_state)
+        return sample(self.skill, situation, n_samples, random_state)
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:
         """Mean log-likelihood per time step of local coordinates and time; higher is better.

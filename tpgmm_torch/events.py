@@ -240,8 +240,7 @@ def smooth_speed(values: Array, time: Array, length: float) -> Array:
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     rates = np.gradient(values, time, axis=0)
     smooth = uniform_filter1d(rates, 2 * half + 1, axis=0, mode="nearest")
-    speed: Array = np.linalg.norm(smooth, axis=1)
-    return speed
+    return np.asarray(np.linalg.norm(smooth, axis=1))
 
 
 def move_start(
@@ -270,8 +269,7 @@ def move_start(
 def without_spikes(values: Array, time: Array, length: float = 0.1) -> Array:
     """Filter signals ``values`` (T, n) at ``time`` (T,) by medians over a ``length`` [s]."""
     half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
-    filtered: Array = median_filter(values, size=(2 * half + 1, 1), mode="nearest")
-    return filtered
+    return np.asarray(median_filter(values, size=(2 * half + 1, 1), mode="nearest"))
 
 
 def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
@@ -335,8 +333,7 @@ def _principal(values: Array) -> Array:
     if values.shape[1] == 1:
         return values[:, 0]
     weights = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)[2][0]
-    summed: Array = values @ (weights if weights.sum() >= 0 else -weights)
-    return summed
+    return np.asarray(values @ (weights if weights.sum() >= 0 else -weights))
 
 
 def between_levels(values: Array) -> tuple[Array, float]:

@@ -73,7 +73,7 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     # of a few matrices, Python is faster than an operation
-    if any(info.tolist()) if info.ndim == 1 and len(info) <= FEW else info.any():
+    if any(info.tolist()) if info.ndim == 1 and info.shape[0] <= FEW else info.any():
         raise DataError(
             f"{name} is not positive definite ({int((info != 0).sum())} of {info.numel()} "
             f"matrices of size {matrix.shape[-1]}): a direction has no variance; a larger "
@@ -271,11 +271,12 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     >>> float(mean), float(covariance)
     (0.0, 1.0)
     """
-    mean = (weights.unsqueeze(-2) @ means).squeeze(-2)
-    residual = means - mean.unsqueeze(-2)
-    within = (weights.unsqueeze(-2) @ covariances.flatten(-2)).squeeze(-2)
+    row = weights.unsqueeze(-2)
+    mean = row @ means
+    residual = means - mean
+    within = row @ covariances.flatten(-2)
     between = (weights.unsqueeze(-1) * residual).mT @ residual
-    return mean, within.view(*within.shape[:-1], *covariances.shape[-2:]) + between
+    return mean.squeeze(-2), within.view(*within.shape[:-2], *covariances.shape[-2:]) + between
 
 
 def log_density(

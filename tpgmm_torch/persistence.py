@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import FunctionType, MethodType, UnionType
+from types import FunctionType, MappingProxyType, MethodType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -71,7 +71,7 @@ ACCEPTED: dict[Any, Any] = {float: (float, int), Any: object, Skill: object}
 LEARNED = ("weights", "means", "covariances", "time", "holds", "n_demonstrations")
 
 
-def save(model: Any, path: str | Path) -> None:
+def save(model: TaskParameterizedGMM | Skill, path: str | Path) -> None:
     """Write a fitted model or a skill to a folder, atomically.
 
     Parameters
@@ -126,7 +126,9 @@ def _digest(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None) -> Any:
+def load(
+    path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
+) -> TaskParameterizedGMM | Skill:
     """Read a model or a skill; nothing in its folder is executed.
 
     Parameters
@@ -217,7 +219,7 @@ def load_model(
 
 def load_skill(
     path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
-) -> Any:
+) -> Skill:
     """:func:`tpgmm_torch.load` what runs: a skill, or that of an estimator.
 
     Parameters
@@ -313,7 +315,8 @@ def _list_arguments(thing: Any) -> dict[str, Any]:
 def decode(
     description: Any,
     custom: abc.Sequence[type] = (),
-    tensors: Mapping[str, Tensor] | None = None,
+    tensors: Mapping[str, Tensor] = MappingProxyType({}),
+    entry: str = "model",
 ) -> Any:
     """Make a model or a part of it again, the inverse of :func:`encode`.
 
@@ -325,19 +328,14 @@ def decode(
         User-defined classes that may occur; no other code is ever looked up.
     tensors : mapping of str to Tensor, optional
         Those that were described, on the device where they are wanted.
+    entry : str, default="model"
+        How errors name it.
 
     Raises
     ------
     ModelFileError
         If a class is not known or does not take these fields.
     """
-    return _decode(description, "model", custom, tensors or {})
-
-
-def _decode(
-    description: Any, entry: str, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
-) -> Any:
-    """Decode an entry; errors name it."""
     try:
         return _read_entry(description, entry, custom, tensors)
     except ModelFileError:
@@ -352,7 +350,7 @@ def _read_entry(
 ) -> Any:
     if isinstance(description, list):
         pairs = enumerate(description)
-        return tuple(_decode(one, f"{entry}.{k}", custom, tensors) for k, one in pairs)
+        return tuple(decode(one, custom, tensors, f"{entry}.{k}") for k, one in pairs)
     if not isinstance(description, Mapping):
         return description
     if "float" in description:
@@ -362,7 +360,7 @@ def _read_entry(
     if "config" in description:  # of a class, which reads it itself
         return _rebuild(dict(description), custom)
     fields = description.get("mapping", description).items()
-    given = {key: _decode(one, f"{entry}.{key}", custom, tensors) for key, one in fields}
+    given = {key: decode(one, custom, tensors, f"{entry}.{key}") for key, one in fields}
     return given if "mapping" in description else _rebuild(given, custom)
 
 
@@ -444,7 +442,7 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
         yield f"time_variance of operator {j}", one.time_variance.log(), (count,)
 
 
-def validate(model: Any) -> Any:
+def validate[Model: (TaskParameterizedGMM, Skill)](model: Model) -> Model:
     """Validate a model or a skill by running it once; returns it.
 
     Parameters

@@ -78,18 +78,15 @@ def _constants(dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
 
 
 @lru_cache
-def quaternion_blocks(
-    starts: tuple[int, ...],
-    size: int,
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
-) -> Tensor:
-    """Mark quaternions among ``size`` coordinates: a row of ones and zeros for each."""
+def _quaternion_sums(
+    starts: tuple[int, ...], size: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Tabulate what sums each quaternion's coordinates, and a 1 for those of none."""
     with torch.inference_mode(False):
-        blocks = torch.zeros(len(starts), size, dtype=dtype, device=device)
-        for block, start in zip(blocks, starts, strict=True):
-            block[start : start + 4] = 1.0
-        return blocks
+        sums = torch.zeros(size, size, dtype=dtype)
+        for start in starts:
+            sums[start : start + 4, start : start + 4] = 1.0
+        return sums.to(device), (1.0 - sums.diagonal()).to(device)
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
@@ -174,8 +171,8 @@ def hemisphere_signs(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,))
     >>> hemisphere_signs(x, reference, [2]).tolist()
     [1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
     """
-    blocks = quaternion_blocks(tuple(starts), x.shape[-1], x.dtype, x.device)
-    return 1.0 + (hemisphere_sign((x * reference) @ blocks.mT) - 1.0) @ blocks
+    sums, others = _quaternion_sums(tuple(starts), x.shape[-1], x.dtype, x.device)
+    return hemisphere_sign((x * reference) @ sums + others)
 
 
 def match_hemisphere(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,)) -> Tensor:

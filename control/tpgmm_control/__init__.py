@@ -3,8 +3,9 @@
 The layer above :mod:`tpgmm_torch`, which never imports it.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from tpgmm_torch.late import load_late
 
 # loaded when it is first asked for, as in tpgmm_torch: a clock's text needs no PyTorch
 if TYPE_CHECKING:
@@ -15,24 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Clock", "Command", "Controller", "Status", "rollout"]
 
-_HOMES = {
-    "Clock": "loop.clock",
-    "Command": "loop.command",
-    "Controller": "loop.controller",
-    "Status": "loop.command",
-    "rollout": "loop.rollout",
-}
-
-
-def __getattr__(name: str) -> object:
-    """Load a public name when it is first asked for (PEP 562)."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """List public names, whether or not they are loaded yet."""
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = load_late(
+    globals(),
+    {
+        ".loop.clock": ("Clock",),
+        ".loop.command": ("Command", "Status"),
+        ".loop.controller": ("Controller",),
+        ".loop.rollout": ("rollout",),
+    },
+)

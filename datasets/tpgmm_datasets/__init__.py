@@ -3,8 +3,9 @@
 Needs the extra ``data`` (pandas, pyarrow); LeRobot itself is never imported.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from tpgmm_torch.late import load_late
 
 # what needs pandas and PyTorch is loaded when it is first asked for, so that the commands
 # here are quick to look up
@@ -56,15 +57,13 @@ _HOMES = {
     ".units": ("Scale",),
     ".writer": ("add_frames", "save_lerobot"),
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_load, __dir__ = load_late(globals(), _HOMES)
 
 
 def __getattr__(name: str) -> object:
     """Load a public name when it is first asked for."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        module = import_module(_HOME[name], __name__)
+        return _load(name)
     except ModuleNotFoundError as error:
         if error.name not in ("pandas", "pyarrow"):
             raise
@@ -73,10 +72,3 @@ def __getattr__(name: str) -> object:
         raise DependencyError(
             f"data sets need {error.name}: pip install 'tpgmm-torch[data]'"
         ) from None
-    globals()[name] = getattr(module, name)
-    return globals()[name]
-
-
-def __dir__() -> list[str]:
-    """List public names, whether or not they are loaded yet."""
-    return sorted({*globals(), *__all__})

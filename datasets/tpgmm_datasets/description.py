@@ -20,6 +20,9 @@ from tpgmm_torch.data.pose_names import is_gripper, pose_groups
 
 __all__ = ["DatasetInfo", "describe_lerobot"]
 
+#: By column.
+Values = dict[str, Any]
+
 
 @dataclass(frozen=True)
 class ColumnInfo(Feature):
@@ -171,12 +174,9 @@ def _find_joints(layout: Layout, problems: list[DatasetError]) -> str | None:
     return joints
 
 
-def _summarise_values(
-    episodes: Iterable[EpisodeRows],
-) -> tuple[dict[str, tuple[Any, Any]], dict[str, Any]]:
+def _summarise_values(episodes: Iterable[EpisodeRows]) -> tuple[Values, Values]:
     """Return the range of each value by column, and the sums of those of tracking."""
-    ranges: dict[str, tuple[Any, Any]] = {}
-    sums: dict[str, Any] = {}
+    ranges, sums = Values(), Values()
     for rows in episodes:
         for key, values in rows.values.items():
             low, high = values.min(axis=0), values.max(axis=0)
@@ -196,9 +196,7 @@ def _share_tracked(layout: Layout, sums: Mapping[str, Any]) -> dict[str, tuple[f
     return {name: (float(seen), float(known)) for name, seen, known in named}
 
 
-def _describe_column(
-    feature: Feature, extremes: tuple[Any, Any] | None, joints: str | None
-) -> ColumnInfo:
+def _describe_column(feature: Feature, extremes: Any, joints: str | None) -> ColumnInfo:
     if extremes is None:
         return ColumnInfo(**vars(feature))
     low, high = (tuple(map(float, values)) for values in extremes)

@@ -43,6 +43,8 @@ SIGNALS = {
     "release": ("end", "high"),
 }
 SIDES = {"left", "right"}
+#: First row of each, and the row behind it.
+Stretches = Sequence[tuple[int, int]]
 GRAMMAR = (
     "closing:SIGNALS and opening:SIGNALS (begin and end of the longest time that a gripper is "
     "low), contact:SIGNALS and release:SIGNALS (of the longest time that a force is high, "
@@ -162,9 +164,7 @@ class SignalEvent(Detector):
         steepness = max(0.0, 1 - 2 * change / max(lengths[longest], 1e-9))
         return Detection(at, float(contrast * steepness * _uniqueness(lengths, longest)))
 
-    def _choose_stretches(
-        self, stretches: Sequence[tuple[int, int]], total: int
-    ) -> Sequence[tuple[int, int]]:
+    def _choose_stretches(self, stretches: Stretches, total: int) -> Stretches:
         """Choose stretches whose edge is seen, and if any is, whose begin is seen too."""
         begun = [(start, stop) for start, stop in stretches if start > 0]
         if self.edge == "begin":
@@ -450,7 +450,7 @@ def _time(demonstration: Demonstration) -> Array:
     return as_array(demonstration.time)
 
 
-def _find_rests(speed: Array, peak: float) -> list[tuple[int, int]]:
+def _find_rests(speed: Array, peak: float) -> Stretches:
     """Find from which row to which a link rests between two motions."""
     return [
         (start, stop)

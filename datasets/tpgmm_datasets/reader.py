@@ -11,18 +11,13 @@ from typing import Any
 
 from tpgmm_datasets.checks.check import PACKAGE, check_summaries
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_datasets.conversion import joints as named
 from tpgmm_datasets.conversion.assembly import (
     Assembly,
     EventSource,
     FrameSource,
     event_sources,
     frame_sources,
-)
-from tpgmm_datasets.conversion.joints import (
-    JointColumns,
-    commanded_joints,
-    joint_feature,
-    names_of,
 )
 from tpgmm_datasets.errors import DatasetError, list_problems
 from tpgmm_datasets.events import doubtful_events
@@ -176,11 +171,11 @@ def open_recording(
     for problem in layout.problems:
         policy(problem)
     policy.warn()
-    feature = layout.feature(joint_feature(layout, joints))
+    feature = layout.feature(named.joint_feature(layout, joints))
     if calibration is not None:
-        names = feature.names or names_of(feature, joint_names, robot)
+        names = feature.names or named.names_of(feature, joint_names, robot)
         units = _calibrate_units(feature, calibration, names, units)
-    columns = JointColumns.choose(feature, joint_names, units, robot)
+    columns = named.JointColumns.choose(feature, joint_names, units, robot)
     if calibration is not None:
         _check_calibrated(columns)
     chosen = tuple(select_episodes(layout, episodes))
@@ -193,7 +188,7 @@ def open_recording(
         assembly.joints.values(stated, file="meta/stats.json")
     findings = list[Finding]()
     if not joints:
-        findings += commanded_joints(layout, feature.key)
+        findings += named.commanded_joints(layout, feature.key)
     if frames is None:
         findings += _find_unnamed_frames(layout)
     return Recording(chosen, assembly, policy.names, tuple(findings))
@@ -208,7 +203,7 @@ def _find_unnamed_frames(layout: Layout) -> Iterator[Finding]:
         yield Finding("frames", message, remedy, (ENVIRONMENT,))
 
 
-def _check_calibrated(columns: JointColumns) -> None:
+def _check_calibrated(columns: named.JointColumns) -> None:
     """Check that values without a motor have units."""
     feature = columns.feature
     pairs = zip(feature.names or (), columns.units, strict=False)

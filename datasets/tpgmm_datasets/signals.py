@@ -21,6 +21,10 @@ from tpgmm_datasets.units import Scale, add_offsets
 CELL = "meta/cell.json"
 REMEDY = "A policy observes each joint, and gives an action for it"
 
+#: Of values; and what makes radians or metres of them, by name.
+Names = tuple[str, ...] | None
+Scales = dict[str, Scale]
+
 
 @dataclass(frozen=True)
 class Signals:
@@ -99,18 +103,14 @@ class Signals:
         )
 
 
-def _select_scales(
-    columns: JointColumns, scales: Sequence[Scale], robot: Any
-) -> dict[str, Scale]:
+def _select_scales(columns: JointColumns, scales: Sequence[Scale], robot: Any) -> Scales:
     """Select the scales of the robot's joints, of all values without a robot."""
     names = columns.names or ()
     joints = names if robot is None else robot.joint_names
     return {n: scale for n, scale in zip(names, scales, strict=False) if n in joints}
 
 
-def _locate_frames(
-    sources: Mapping[str, Any], environment: Feature
-) -> dict[str, tuple[int, ...]]:
+def _locate_frames(sources: dict[str, Any], environment: Feature) -> dict[str, tuple[int, ...]]:
     """Locate frames that the environment's values hold as position and quaternion."""
     stored = {name: pose for name, pose in sources.items() if isinstance(pose, FramePose)}
     form = ENVIRONMENT, "wxyz", 1
@@ -122,11 +122,8 @@ def _locate_frames(
 
 
 def _name_entries(
-    features: Mapping[str, Feature],
-    columns: JointColumns,
-    joint_names: Any,
-    scales: Mapping[str, Scale],
-) -> dict[str, tuple[str, ...] | None]:
+    features: Mapping[str, Feature], columns: JointColumns, joint_names: Any, scales: Scales
+) -> dict[str, Names]:
     """Name the entries of states and actions as ``joint_names`` says, and check their units."""
     if joint_names is None or (joint_names and isinstance(joint_names, Mapping)):
         given, called = None, joint_names or {}
@@ -141,9 +138,7 @@ def _name_entries(
     return names
 
 
-def _find_names(
-    feature: Feature, source: Feature, given: tuple[str, ...] | None
-) -> tuple[str, ...] | None:
+def _find_names(feature: Feature, source: Feature, given: Names) -> Names:
     """Find the names of values; those without names are the joints in order."""
     alike = feature.width == source.width
     if feature.misnamed and not (alike and given):
@@ -154,9 +149,7 @@ def _find_names(
     return feature.names
 
 
-def _check_units(
-    feature: Feature, names: Sequence[str] | None, scales: Mapping[str, Scale]
-) -> None:
+def _check_units(feature: Feature, names: Names, scales: Scales) -> None:
     """Check that another column of the joints declares the same units, if any."""
     if not names or not feature.units:
         return

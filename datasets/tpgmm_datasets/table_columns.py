@@ -16,6 +16,8 @@ from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameEr
 if TYPE_CHECKING:
     import pandas as pd
 
+    #: Episodes of a table, with what they are called.
+    Parts = Sequence[tuple[Any, pd.DataFrame]]
 
 EVENT, COVARIANCE, WRENCH = "event.", "covariance.", "wrench."
 #: The column that may be missing.
@@ -132,9 +134,7 @@ def list_motion_columns(table: pd.DataFrame, known: Collection[str]) -> list[str
     return [n for n in table.columns if n not in known and not n.startswith(others)]
 
 
-def find_joints(
-    table: pd.DataFrame, parts: Sequence[tuple[Any, pd.DataFrame]], time: str, episode: str
-) -> list[str]:
+def find_joints(table: pd.DataFrame, parts: Parts, time: str, episode: str) -> list[str]:
     """Find the columns that are joints: those known to be, and those that are nothing else.
 
     Parameters
@@ -171,9 +171,7 @@ def _drop_poses(names: list[str]) -> list[str]:
     return [name for i, name in enumerate(names) if i not in in_poses]
 
 
-def _check_joints(
-    table: pd.DataFrame, parts: Sequence[tuple[Any, pd.DataFrame]], names: list[str], time: str
-) -> None:
+def _check_joints(table: pd.DataFrame, parts: Parts, names: list[str], time: str) -> None:
     """Refuse columns that cannot be joints, and warn of those that may count something."""
     for frame, missing in _find_incomplete_poses(names).items():
         raise DataError(
@@ -188,9 +186,7 @@ def _check_joints(
         _warn(f"columns {even} change by the same in every row: {asked}")
 
 
-def _refuse_counters(
-    parts: Sequence[tuple[Any, pd.DataFrame]], names: list[str], time: str
-) -> list[str]:
+def _refuse_counters(parts: Parts, names: list[str], time: str) -> list[str]:
     """Refuse columns that count rows or tell the time; return those that change evenly."""
     counters = [name for name in names if COUNTS.fullmatch(name)]
     steady = {n: _classify_steps(parts, n, time) for n in names if n not in counters}
@@ -206,7 +202,7 @@ def _warn(message: str) -> None:
     warnings.warn(message, PlausibilityWarning, skip_file_prefixes=(PACKAGE,))
 
 
-def _classify_steps(parts: Sequence[tuple[Any, pd.DataFrame]], name: str, time: str) -> str:
+def _classify_steps(parts: Parts, name: str, time: str) -> str:
     """Return ``"counter"`` (a clock too), ``"evenly"`` if a column changes so, else ``""``."""
     steps = np.concatenate([np.diff(part[name].to_numpy(float)) for _, part in parts])
     if len(steps) < FEWEST_COUNTED - 1 or not steps[0]:

@@ -20,16 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from tpgmm_datasets.table_columns import (
-    COVARIANCE,
-    EPISODE,
-    EVENT,
-    JOINTS,
-    WRENCH,
-    check_columns,
-    find_joints,
-    list_motion_columns,
-)
+from tpgmm_datasets import table_columns as roles
 from tpgmm_torch.atomic import open_whole, replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
@@ -57,6 +48,8 @@ SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11}
 FORMULA = re.compile(r"'*[=+@\t\r-]")
 #: Rows times columns beyond which a table is not read.
 MOST_NUMBERS = 2e7
+
+Motion = Demonstration | Trajectory
 
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
@@ -93,7 +86,7 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
     parts = [
         _motion_columns(episode, one, one.frames)
         | _wrench_columns(one)
-        | {f"{EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
+        | {f"{roles.EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
         for episode, one in enumerate(checked)
     ]
     return _join_parts(parts, checked[0])
@@ -132,11 +125,9 @@ def trajectories_to_frame(
     parts = []
     for episode, (one, poses) in enumerate(zip(trajectories, situations, strict=True)):
         rows, columns = np.triu_indices(len(one.joint_names))
-        upper = as_array(one.covariance)[:, rows, columns]
-        names = _covariance_names(one.joint_names)
-        parts.append(
-            _motion_columns(episode, one, poses) | dict(zip(names, upper.T, strict=True))
-        )
+        values = as_array(one.covariance)[:, rows, columns].T
+        upper = dict(zip(_covariance_names(one.joint_names), values, strict=True))
+        parts.append(_motion_columns(episode, one, poses) | upper)
     return _join_parts(parts, trajectories[0])
 
 
@@ -145,7 +136,7 @@ def demonstrations_from_frame(
     *,
     joints: Sequence[str] | None = None,
     time: str = "time",
-    episode: str = EPISODE,
+    episode: str = roles.EPISODE,
 ) -> list[Demonstration]:
     """Read the demonstrations in a table.
 
@@ -183,22 +174,21 @@ def demonstrations_from_frame(
     >>> demonstrations_from_frame(table, time="t")
     [Demonstration(2 steps, 0.10 s, 2 joints, frames=[], events={})]
     """
-    table = check_columns(table, joints, time, episode)
+    table = roles.check_columns(table, joints, time, episode)
     whole = episode not in table.columns
     parts = [(0, table)] if whole else [*table.groupby(episode, sort=False)]
     parts = [(label, _in_seconds(part, time)) for label, part in parts]
-    names = list(joints) if joints is not None else find_joints(table, parts, time, episode)
+    found = joints if joints is not None else roles.find_joints(table, parts, time, episode)
+    names = list(found)
     called = None if names == [str(i) for i in range(len(names))] else tuple(names)
     made = []
     for label, part in parts:
         kept = part.dropna(axis="columns", how="all")
         try:
-            at, values = map(
-                torch.from_numpy, (numbers(kept, [time])[:, 0], numbers(kept, names))
-            )
+            at, values = (torch.from_numpy(numbers(kept, each)) for each in ([time], names))
             poses, events = _read_poses(kept, {time, episode, *names}), _read_events(kept)
             forces = {n: torch.from_numpy(w) for n, w in _read_wrenches(kept).items()}
-            made.append(Demonstration(at, values, poses, called, events, wrenches=forces))
+            made.append(Demonstration(at[:, 0], values, poses, called, events, wrenches=forces))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
     return made
@@ -300,7 +290,7 @@ def _read_parquet(file: Any) -> pd.DataFrame:
 def _covariance_names(joint_names: Sequence[str]) -> list[str]:
     """Name the columns of the upper triangle of the covariance of joints, row by row."""
     pairs = zip(*np.triu_indices(len(joint_names)), strict=True)
-    return [f"{COVARIANCE}{joint_names[i]}.{joint_names[j]}" for i, j in pairs]
+    return [f"{roles.COVARIANCE}{joint_names[i]}.{joint_names[j]}" for i, j in pairs]
 
 
 def _import_pandas() -> Any:
@@ -318,11 +308,11 @@ def _check_suffix(path: Path) -> Path:
 
 
 def _motion_columns(
-    episode: int, motion: Demonstration | Trajectory, frames: Mapping[str, Frame]
+    episode: int, motion: Motion, frames: Mapping[str, Frame]
 ) -> dict[str, Array]:
     """Return the columns of episode, time, joints and frames."""
     rows, names = len(motion), _name_joints(motion)
-    columns = [(EPISODE, np.full(rows, episode)), ("time", as_array(motion.time))]
+    columns = [(roles.EPISODE, np.full(rows, episode)), ("time", as_array(motion.time))]
     columns += zip(names, as_array(motion.joints).T, strict=True)
     for name, frame in frames.items():
         pose = as_array(torch.cat((frame.position, frame.orientation), -1))
@@ -334,17 +324,15 @@ def _motion_columns(
     return dict(columns)
 
 
-def _join_parts(
-    parts: Sequence[Mapping[str, Array]], motion: Demonstration | Trajectory
-) -> pd.DataFrame:
+def _join_parts(parts: Sequence[Mapping[str, Array]], motion: Motion) -> pd.DataFrame:
     pandas = _import_pandas()
     table = pandas.concat([pandas.DataFrame(part) for part in parts], ignore_index=True)
     # parquet keeps it: joints may have names like those of poses
-    table.attrs[JOINTS] = _name_joints(motion)
+    table.attrs[roles.JOINTS] = _name_joints(motion)
     return table
 
 
-def _name_joints(motion: Demonstration | Trajectory) -> list[str]:
+def _name_joints(motion: Motion) -> list[str]:
     return list(motion.joint_names or map(str, range(motion.joints.shape[-1])))
 
 
@@ -355,7 +343,7 @@ def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
     if kind in "biuf" and unit is None:
         return part
     options = {"unit": unit} if unit else {"format": "ISO8601", "utc": True}
-    names = [time, *(name for name in part.columns if name.startswith(EVENT))]
+    names = [time, *(name for name in part.columns if name.startswith(roles.EVENT))]
     try:
         dates = part[names]
         dates = dates if kind == "m" else dates.apply(_import_pandas().to_datetime, **options)
@@ -373,7 +361,7 @@ def _find_epoch_unit(first: Any, kind: str) -> str | None:
 
 def _read_poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
     """Read the frames, constant where nothing changes."""
-    columns = list_motion_columns(part, others)
+    columns = roles.list_motion_columns(part, others)
     frames: dict[str, Frame] = {}
     for name, group in pose_groups(columns).items():
         pose = numbers(part, [columns[i] for i in group])
@@ -385,7 +373,7 @@ def _read_poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
 def _wrench_columns(motion: Demonstration) -> dict[str, Array]:
     """Return the values of wrenches, by column."""
     return {
-        f"{WRENCH}{link}.{part}": values
+        f"{roles.WRENCH}{link}.{part}": values
         for link, wrench in motion.wrenches.items()
         for part, values in zip(WRENCH_PARTS, as_array(wrench).T, strict=True)
     }
@@ -393,24 +381,22 @@ def _wrench_columns(motion: Demonstration) -> dict[str, Array]:
 
 def _read_wrenches(part: pd.DataFrame) -> dict[str, Array]:
     """Read wrenches (T, 6) by link."""
-    columns = [name for name in part.columns if name.startswith(WRENCH)]
-    links = dict.fromkeys(name.removeprefix(WRENCH).rpartition(".")[0] for name in columns)
-    found = {
-        link: numbers(part, [f"{WRENCH}{link}.{axis}" for axis in WRENCH_PARTS])
-        for link in links
-    }
+    columns = [name for name in part.columns if name.startswith(roles.WRENCH)]
+    links = dict.fromkeys(name[len(roles.WRENCH) :].rpartition(".")[0] for name in columns)
+    parts = {link: [f"{roles.WRENCH}{link}.{axis}" for axis in WRENCH_PARTS] for link in links}
+    found = {link: numbers(part, names) for link, names in parts.items()}
     if odd := [name for name in columns if name.rpartition(".")[2] not in WRENCH_PARTS]:
-        raise DataError(f"columns {odd} are not {WRENCH}LINK. and {list(WRENCH_PARTS)}")
+        raise DataError(f"columns {odd} are not {roles.WRENCH}LINK. and {list(WRENCH_PARTS)}")
     return found
 
 
 def _read_events(part: pd.DataFrame) -> dict[str, float]:
     events = {}
-    for name in (name for name in part.columns if name.startswith(EVENT)):
+    for name in (name for name in part.columns if name.startswith(roles.EVENT)):
         values = numbers(part, [name])
         if bool((values != values[0]).any()):
             raise DataError(f"column {name!r} is one time [s], but it changes")
-        events[name.removeprefix(EVENT)] = float(values[0, 0])
+        events[name.removeprefix(roles.EVENT)] = float(values[0, 0])
     return events
 
 

@@ -155,9 +155,7 @@ def convert(
     return converted
 
 
-def _check_stored(
-    name: str, scale: Scale, values: Array, column: str, where: Mapping[str, Any]
-) -> None:
+def _check_stored(name: str, scale: Scale, values: Array, column: str, where: Any) -> None:
     """Refuse values (T,) beyond the range to which they were normalised."""
     low, high = scale.stored or (-math.inf, math.inf)
     least, most = values.min(), values.max()

@@ -20,26 +20,13 @@ import pyarrow as pa
 from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources, stored_frames
 from tpgmm_datasets.conversion.poses import MeasuredPoses
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.columns import (
-    ENVIRONMENT,
-    action_column,
-    demonstration_columns,
-    feature_table,
-    features_of,
-    frame_columns,
-    with_frames,
-)
+from tpgmm_datasets.lerobot import columns as kept
+from tpgmm_datasets.lerobot import statistics as summed
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.files import METADATA_KEY, file_path, free_place, write_tables
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout, open_layout
 from tpgmm_datasets.lerobot.parquet import open_parquet, read_columns
-from tpgmm_datasets.lerobot.statistics import (
-    QUANTILES,
-    Statistics,
-    episode_statistics,
-    merge_statistics,
-)
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
@@ -131,7 +118,7 @@ def save_lerobot(
         "codebase_version": "v3.0",
         "robot_type": robot_type,
         "fps": int(fps),
-        "features": features_of(demonstrations, dtype, units),
+        "features": kept.features_of(demonstrations, dtype, units),
         "chunks_size": CHUNK_FILES,
         "data_files_size_in_mb": FILE_MEGABYTES,
         "video_files_size_in_mb": 200,
@@ -223,7 +210,8 @@ def add_frames(
             "LINK@EVENT and features are learned from the set as it is"
         )
     columns = columns or {}
-    declared = {ENVIRONMENT: with_frames(layout.features.get(ENVIRONMENT), list(sources))}
+    environment = layout.features.get(kept.ENVIRONMENT)
+    declared = {kept.ENVIRONMENT: kept.with_frames(environment, list(sources))}
     declared |= {key: column.declaration for key, column in columns.items()}
     if there := columns.keys() & layout.features.keys():
         raise DatasetError(f"the set has the columns {sorted(there)} already")
@@ -261,29 +249,31 @@ def _add_columns(
     sources: Mapping[str, Any],
     columns: Mapping[str, Column],
     declared: Mapping[str, Any],
-) -> dict[int, Statistics]:
+) -> dict[int, summed.Statistics]:
     """Add the declared columns to the data files; return their statistics by episode."""
-    found = dict[int, Statistics]()
-    old = [layout.features[ENVIRONMENT]] if ENVIRONMENT in layout.features else []
+    found = dict[int, summed.Statistics]()
+    old = [layout.features[kept.ENVIRONMENT]] if kept.ENVIRONMENT in layout.features else []
     read = read_episodes(layout, layout.episodes, old, Relaxed(()))
     for file, episodes in groupby(read, key=lambda rows: rows.episode.file):
         parts = []
         for rows in episodes:
-            values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
+            values = rows.values.get(kept.ENVIRONMENT, np.empty((len(rows.time), 0)))
             index = rows.episode.index
             poses = stored_frames(layout, sources, rows)
-            added = frame_columns(values, poses, declared, index)
+            added = kept.frame_columns(values, poses, declared, index)
             added |= {key: column.values[index] for key, column in columns.items()}
-            parts.append(feature_table(added, declared))
-            found[index] = episode_statistics(added)
+            parts.append(kept.feature_table(added, declared))
+            found[index] = summed.episode_statistics(added)
         table = pa.concat_tables(parts)
         _rewrite(layout.root, new, file, {key: table[key] for key in declared})
     return found
 
 
-def _add_statistics(new: Path, old: Path, found: Mapping[int, Statistics]) -> Statistics:
+def _add_statistics(
+    new: Path, old: Path, found: Mapping[int, summed.Statistics]
+) -> summed.Statistics:
     """Add statistics to the lists of episodes; return those of the whole set."""
-    whole = reduce(merge_statistics, found.values())
+    whole = reduce(summed.merge_statistics, found.values())
     names = [(feature, name) for feature in whole for name in whole[feature]]
     for listed in (old / "meta" / "episodes").glob("*/*.parquet"):
         [column] = read_columns(listed, old, ["episode_index"]).columns
@@ -347,9 +337,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 def _tasks(task: str | Sequence[str], count: int) -> list[str]:
     tasks = [task] * count if isinstance(task, str) else list(task)
     if len(tasks) != count or not all(isinstance(item, str) and item for item in tasks):
-        raise DatasetError(
-            f"task is one text or one per demonstration, not empty; got {task!r}"
-        )
+        raise DatasetError(f"task is a text or one per demonstration, not empty; got {task!r}")
     return tasks
 
 
@@ -437,15 +425,15 @@ class _Writer:
         if first is not None:
             shown = shown.reorder(first)
             commanded = commanded and commanded.reorder(first)
-        columns = demonstration_columns(shown, number, features, self.info["fps"])
+        columns = kept.demonstration_columns(shown, number, features, self.info["fps"])
         if commanded is not None:
-            columns |= action_column(commanded, number, features)
+            columns |= kept.action_column(commanded, number, features)
         rows = len(shown)
         columns["episode_index"] = np.full((rows, 1), self.episodes)
         columns["index"] = np.arange(self.rows, self.rows + rows)[:, None]
         columns["task_index"] = np.full((rows, 1), self.tasks.index(task))
         columns = {key: columns[key] for key in features}
-        new, before = episode_statistics(columns), self.statistics
+        new, before = summed.episode_statistics(columns), self.statistics
         row: dict[str, Any] = {
             "episode_index": self.episodes,
             "tasks": [task],
@@ -458,9 +446,9 @@ class _Writer:
         for key, column in new.items():
             row |= {f"stats/{key}/{name}": column[name].tolist() for name in column}
         self.listed.append(row)
-        self.statistics = new if before is None else merge_statistics(before, new)
+        self.statistics = new if before is None else summed.merge_statistics(before, new)
         self.episodes, self.rows = self.episodes + 1, self.rows + rows
-        return feature_table(columns, features)
+        return kept.feature_table(columns, features)
 
     def _tables(self) -> None:
         meta = self.root / "meta"
@@ -486,15 +474,13 @@ def _episode_type(key: str) -> pa.DataType:
     return pa.int64()
 
 
-def _old_statistics(old: Layout) -> Statistics:
+def _old_statistics(old: Layout) -> summed.Statistics:
     path = old.root / "meta" / "stats.json"
-    needed = {"min", "max", "mean", "std", "count", *QUANTILES}
+    needed = {"min", "max", "mean", "std", "count", *summed.QUANTILES}
     with suppress(OSError, ValueError, TypeError, AttributeError):
         stored = json.loads(path.read_text(encoding="utf-8"))
-        statistics = {
-            key: {n: np.array(v) for n, v in stored[key].items()} for key in old.features
-        }
-        if all(needed <= set(column) for column in statistics.values()):
-            return statistics
+        found = {key: {n: np.array(v) for n, v in stored[key].items()} for key in old.features}
+        if all(needed <= set(column) for column in found.values()):
+            return found
     message = "statistics of some columns are missing or not readable; the set cannot grow"
     raise DatasetError(message, file="meta/stats.json")

@@ -28,8 +28,8 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
     camera : str
         Of the simulated model, from which pictures are taken.
     render_mode : {"rgb_array"}, optional
-    picture_size : (int, int)
-        Width and height.
+    render_width, render_height : int, default=320, 240
+        Of the pictures.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -39,15 +39,16 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         fps: int,
         episode_length: int,
         camera: str,
-        render_mode: str | None,
-        picture_size: tuple[int, int],
+        render_mode: str | None = None,
+        render_width: int = 320,
+        render_height: int = 240,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise DataError(f"render_mode is None or 'rgb_array', got {render_mode!r}")
         self.fps, self.episode_length, self.render_mode = fps, episode_length, render_mode
         self.metadata = {**type(self).metadata, "render_fps": fps}
         self._max_episode_steps = episode_length  # the name that LeRobot looks for
-        self._camera, self._picture_size = camera, picture_size
+        self._camera, self._picture_size = camera, (render_width, render_height)
         self._renderer: Renderer | None = None
         self._picture: NDArray[np.uint8] | None = None
         self._pictured = 0  # the step of it

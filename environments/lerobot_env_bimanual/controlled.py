@@ -6,6 +6,7 @@ import math
 import zlib
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,6 +37,26 @@ NOISE_JOINTS = 2e-3
 NOISE_POSE = np.array([1e-3] * 3 + [math.radians(0.5)] * 3)
 #: The range in which an object is observed: position [m] and quaternion.
 RANGE = np.array([5.0] * 3 + [1.0] * 4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every task, as :class:`ControlledEnv` describes them."""
+
+    fps: int = 100
+    mode: str = "dynamic"
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    track: bool = False
+    condition: str | Sequence[Disturbance] = NOMINAL
+    cameras: str | Sequence[str] = ()
+    camera_width: int = 640
+    camera_height: int = 480
+    observe_objects: bool = True
+    render_mode: str | None = None
+    render_width: int = 320
+    render_height: int = 240
 
 
 class ControlledEnv(StateEnv):
@@ -121,28 +142,17 @@ class ControlledEnv(StateEnv):
         scene: RobotScene,
         duration: float,
         course: Course,
-        *,
-        fps: int = 100,
-        mode: str = "dynamic",
-        episode_length: int | None = None,
-        pushes: bool = False,
-        noise: float = 0.0,
-        track: bool = False,
-        condition: str | Sequence[Disturbance] = NOMINAL,
-        cameras: str | Sequence[str] = (),
-        camera_width: int = 640,
-        camera_height: int = 480,
-        observe_objects: bool = True,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
+        **options: Any,
     ) -> None:
-        self.disturbances = parse_condition(condition)
+        asked = Options(**options)
+        self.disturbances = parse_condition(asked.condition)
         delay = sum(disturbance.delay for disturbance in self.disturbances)
-        steps = round((duration + delay) * fps) if episode_length is None else episode_length
-        super().__init__(fps, steps, CAMERA, render_mode, (render_width, render_height))
-        self.mode, self.pushes, self.noise, self.track = mode, pushes, noise, track
-        self.condition, self._course, self._scene = condition, course, scene
+        steps, fps = asked.episode_length, asked.fps
+        steps = round((duration + delay) * fps) if steps is None else steps
+        size = asked.render_width, asked.render_height
+        super().__init__(fps, steps, CAMERA, asked.render_mode, *size)
+        self.mode, self.pushes, self.noise = asked.mode, asked.pushes, asked.noise
+        self.condition, self._course, self._scene = asked.condition, course, scene
         self._check_options()
         self.joint_names = robot.joint_names
         self._lower, self._upper = robot.lower.numpy(), robot.upper.numpy()
@@ -154,18 +164,24 @@ class ControlledEnv(StateEnv):
         joints = spaces.Box(self._lower - 0.5, self._upper + 0.5, dtype=np.float64)
         reach = np.tile(RANGE, len(scene.objects))
         observed: dict[str, spaces.Space[Any]] = {"agent_pos": joints}
-        self.observe_objects = observe_objects
-        if observe_objects:
+        self.observe_objects = asked.observe_objects
+        if self.observe_objects:
             observed["environment_state"] = spaces.Box(-reach, reach, dtype=np.float64)
         observed["timestamp"] = spaces.Box(0.0, 3 * steps / fps, (1,), dtype=np.float64)
         self.eyes = None
-        if views := chosen_views(cameras):
-            picture = spaces.Box(0, 255, (camera_height, camera_width, 3), dtype=np.uint8)
+        if views := chosen_views(asked.cameras):
+            width, height = asked.camera_width, asked.camera_height
+            picture = spaces.Box(0, 255, (height, width, 3), dtype=np.uint8)
             observed["pixels"] = spaces.Dict(dict.fromkeys(views, picture))
-            self.eyes = self.rig(cameras, (camera_width, camera_height))
+            self.eyes = self.rig(asked.cameras, (width, height))
         self.observation_space = spaces.Dict(observed)
-        self._live = track or any(part.live for part in self.disturbances)
+        self._live = asked.track or any(part.live for part in self.disturbances)
         self._steps = steps  # no episode is going on
+
+    @property
+    def scene(self) -> RobotScene:
+        """The simulated world."""
+        return self._scene
 
     def rig(
         self, cameras: str | Sequence[str], size: tuple[int, int] = (640, 480), **options: Any
@@ -228,12 +244,23 @@ class ControlledEnv(StateEnv):
         """Whatever hands do by themselves, and the judge notes, after a tick."""
 
     @abstractmethod
+    def _stands_usually(self, pose: Array) -> bool:
+        """Check whether the task is meant for a first object that begins so."""
+
+    @property
+    def _first(self) -> Array:
+        """Initial pose of the first object."""
+        return self._start.poses[self._scene.names[0]]
+
     def _usual(self, step: Array) -> bool:
         """Check whether the task is meant for a first object displaced so at the start."""
+        return self._stands_usually(displace_pose(self._first, step))
 
-    @abstractmethod
     def _displace(self, step: Array) -> None:
-        """Put the first object where it stood at the start, displaced, unless it is held."""
+        """Put the first object where it stood at the start, displaced, unless it was taken."""
+        first = self._scene.names[0]
+        if not any(hold.thing == first for hold in self._scene.taken):
+            self._scene.put(first, displace_pose(self._first, step))
 
     def _put_on_path(self, instant: float) -> None:
         """Continue the task at an instant of its nominal path, at rest."""

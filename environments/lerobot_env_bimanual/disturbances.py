@@ -65,11 +65,13 @@ class Disturbance:
 
     #: Whether the present poses of the objects are observed, not those of the beginning.
     live: ClassVar[bool] = False
+    #: Whether an episode becomes longer by the ``seconds`` that it takes.
+    delays: ClassVar[bool] = False
 
     @property
     def delay(self) -> float:
         """By how much an episode becomes longer for it [s]."""
-        return 0.0
+        return vars(self)["seconds"] if self.delays else 0.0
 
     def window(self, course: Course) -> tuple[float, float] | None:
         """Between which times its ``moment`` is drawn [s]; None without a moment."""
@@ -136,13 +138,9 @@ class Stopped(Disturbance):
     moment : float, default=NaN
     """
 
+    delays: ClassVar[bool] = True
     seconds: float = 3.0
     moment: float = math.nan
-
-    @property
-    def delay(self) -> float:
-        """As long as the stop."""
-        return self.seconds
 
     def window(self, course: Course) -> tuple[float, float]:
         """At any moment, all equally likely, until the task is done."""
@@ -395,14 +393,10 @@ class PoseLost(Disturbance):
     """
 
     live: ClassVar[bool] = True
+    delays: ClassVar[bool] = True
     seconds: float = 0.5
     stale: bool = False
     moment: float = math.nan
-
-    @property
-    def delay(self) -> float:
-        """As long as there is nothing to go by."""
-        return self.seconds
 
     def window(self, course: Course) -> tuple[float, float]:
         """At any moment before the grasp, after which the poses would matter less."""
@@ -461,14 +455,10 @@ class Spoilt(Disturbance):
     """
 
     live: ClassVar[bool] = True
+    delays: ClassVar[bool] = True
     distance: float = 0.0
     seconds: float = 15.0
     step: Vector | None = dataclasses.field(default=None, compare=False)
-
-    @property
-    def delay(self) -> float:
-        """To try again."""
-        return self.seconds
 
     def draw(self, rng: Rng, course: Course, usual: Usual) -> Self:
         """With the displacement of the episode, as of :class:`Moved`."""

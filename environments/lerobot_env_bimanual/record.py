@@ -27,14 +27,12 @@ from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.eyes import calibration
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
-from lerobot_env_bimanual.eyes.recorder import CODECS, recording_of, rig_to_record, row
+from lerobot_env_bimanual.eyes.recorder import CODECS, recording_before, row
 from lerobot_env_bimanual.eyes.rig import Rig
-from lerobot_env_bimanual.eyes.views import CHECK
 from lerobot_env_bimanual.robot_scene import PALM_SIZE
 from lerobot_env_bimanual.so101 import BI_SO101, TASKS
 from lerobot_env_bimanual.so101.env import BiSo101Env
 from lerobot_env_bimanual.so101.expert import teleoperate
-from lerobot_env_bimanual.so101.waving import record_waving
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import MORE, ROBOTS, SUITE, UPPER_BODY
 from lerobot_env_bimanual.suite.tasks import suite_task
@@ -196,17 +194,14 @@ def record(
     """
     able = expert(task, robot)
     env = able.environment(fps=fps, noise=noise)
-    rig = rig_to_record(env, n, cameras, size)
     env.reset(seed=seed)
-    cell = {**rig.content(), **env.cell_of_joints()}
     settings: dict[str, Any] = {
         "objects": able.objects if true_poses else (),
         "robot_type": env.robot_type or robot,
         "codec": codec,
     }
-    with recording_of(env, rig, out, cell, **settings) as opened:
+    with recording_before(env, out, n, cameras=cameras, size=size, **settings) as (rig, opened):
         _demonstrate(opened, able, env, rig, n, seed, true_poses, progress)
-    rig.close()
     return Path(out)
 
 
@@ -215,20 +210,18 @@ def record_calibration(
     *,
     n: int = 10,
     seed: int = 0,
-    cameras: str | Sequence[str] = "front",
     fps: int = 25,
-    size: tuple[int, int] = (640, 480),
     robot: str = UPPER_BODY,
-    codec: str = "av1",
     hand: str = HANDS[1],
     offset_deg: float = 0.0,
     noise_deg: float = 0.0,
+    **options: Any,
 ) -> Path:
     """Record one episode in which a robot shows a cube of tags in its hand to a camera.
 
     Parameters
     ----------
-    out, seed, cameras, fps, size, codec
+    out, seed, fps
         As of :func:`record`.
     n : int, default=10
         How many postures.
@@ -239,6 +232,8 @@ def record_calibration(
     offset_deg, noise_deg : float, default=0
         Standard deviations of constant errors of the joints that move this hand, and of the
         noise of each reading [deg]. The constant ones are ``joint_offsets`` of the cell file.
+    **options
+        ``cameras``, ``size`` and ``codec``, as of :func:`record`.
 
     Returns
     -------
@@ -253,33 +248,34 @@ def record_calibration(
     """
     if hand not in HANDS:
         raise UnknownNameError("hand", hand, "the recorder", HANDS)
+    env: ControlledEnv
+    reading: tuple[calibration.Reading, calibration.Reading]
     if robot == BI_SO101:
-        return record_waving(
-            out, n=n, seed=seed, cameras=cameras, fps=fps, size=size, codec=codec
-        )
-    env, rng = expert("lid", robot).environment(fps=fps), np.random.default_rng(seed)
-    side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
-    cube = cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)
-    rig = rig_to_record(env, n, cameras, size, carriers={**CHECK, hand: cube}, objects={})
-    env.reset(seed=seed)
-    offsets, moved = np.zeros(len(env.joint_names)), calibration.chain_of(rig, hand)
-    offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
-    cell = {**rig.content(), **env.cell_of_joints()}
-    cell |= {"joint_offsets": {env.joint_names[i]: float(offsets[i]) for i in moved}}
-    postures = calibration.varied_postures(rig, hand, n, rng)
+        env = arms = BiSo101Env(fps=fps)
+        rng = np.random.default_rng((seed, n))
+        env.reset(seed=seed)
+        cubes, cell = arms.take_cubes(), dict[str, Any]()
+        reading = arms.in_stored_units, arms.in_stored_units
+    else:
+        env, rng = expert("lid", robot).environment(fps=fps), np.random.default_rng(seed)
+        env.reset(seed=seed)
+        side = PALM_SIZE[1] + CUBE_ROOM  # palms are turned to each other
+        cubes = {hand: cube_at(IN_HAND[hand], y=side if hand == "r_hand" else -side)}
+        moved, offsets = calibration.chain_of(env.scene, hand), np.zeros(len(env.joint_names))
+        offsets[moved] = np.radians(offset_deg) * rng.standard_normal(len(moved)).round(4)
+        cell = {"joint_offsets": {env.joint_names[i]: float(offsets[i]) for i in moved}}
 
-    def measure(joints: Array) -> Array:
-        noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
-        return np.asarray(joints - offsets + noise)
+        def measure(joints: Array) -> Array:
+            noise = np.radians(noise_deg) * rng.standard_normal(len(joints))
+            return np.asarray(joints - offsets + noise)
 
-    settings = {"robot_type": env.robot_type or robot, "codec": codec}
-    with recording_of(env, rig, out, cell, **settings) as opened:
-        for frame in calibration.calibration_episode(
-            rig, postures, fps, rng, measure, lambda joints: joints - offsets
-        ):
+        reading = measure, lambda joints: joints - offsets
+    tags = {"carriers": {**env.checks, **cubes}, "objects": {}}
+    options |= {"cell": cell, "tags": tags, "robot_type": env.robot_type or robot}
+    with recording_before(env, out, n, **options) as (rig, opened):
+        for frame in calibration.calibration_episode(rig, cubes, n, fps, rng, *reading):
             opened.add_frame(frame)
         opened.save_episode()
-    rig.close()
     return Path(out)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -160,7 +160,6 @@ def train(
     *,
     seed: int,
     budget: float,
-    report: Callable[[str], None] = lambda _text: None,
 ) -> Training:
     """Train a baseline until its validation error has stopped falling.
 
@@ -172,8 +171,6 @@ def train(
         Of weights, batches and noise.
     budget : float
         Seconds of the processor after which training ends in any case.
-    report : callable
-        Called with a line at each validation.
 
     Raises
     ------
@@ -196,7 +193,7 @@ def train(
     )
     rows = torch.linspace(0, len(held_out) - 1, CHECKED).long()
     scale = _action_scale(postprocessor, config)
-    _Learner(recipe, result, windows, held_out.at(rows), scale).run(budget, report)
+    _Learner(recipe, result, windows, held_out.at(rows), scale).run(budget)
     if recipe.phase:
         tell_time(preprocessor, recipe.rate)
     return result
@@ -223,14 +220,13 @@ class _Learner:
         self.averages = [*self.average.parameters()]
         self.steps = 0
 
-    def run(self, budget: float, report: Callable[[str], None]) -> None:
+    def run(self, budget: float) -> None:
         """Train; in the end the policy has the best of the average weights."""
         began = time.process_time()
         best, best_weights, waited, falls = math.inf, None, 0, 0
         while not self.result.outcome:
             point = self._measure_block(began)
             error, seconds = point["validation_error"], point["seconds"]
-            report(" ".join(f"{key} {value:.5g}" for key, value in point.items()))
             waited = 0 if error < 0.99 * best else waited + 1
             if error < best:
                 best, best_weights = error, deepcopy(self.average.state_dict())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -375,6 +375,7 @@ class AlohaInsertionBenchmark(AlohaBenchmark):
     fixed: ClassVar = {"task": "insertion"}
 
 
+ALOHA = ("aloha_state", "aloha_insertion")
 #: The tasks of the suite on other robots than the upper body: their benchmarks' names.
 OTHER_ROBOTS = {
     robot: {f"{task}-{robot}": task for task in SUITE}
@@ -392,6 +393,15 @@ BENCHMARKS: dict[str, Callable[[int | None, Mapping[str, Any] | None], Benchmark
         for robot, tasks in OTHER_ROBOTS.items()
         for name, task in tasks.items()
     },
+}
+
+
+_OTHERS = {*ALOHA, *chain.from_iterable(OTHER_ROBOTS.values())}
+#: Names that stand for several environments.
+GROUPS = {
+    **{f"suite-{robot}": list(tasks) for robot, tasks in OTHER_ROBOTS.items()},
+    "suite": [name for name in BENCHMARKS if name not in _OTHERS],
+    "all": list(BENCHMARKS),
 }
 
 

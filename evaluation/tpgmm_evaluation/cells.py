@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot_env_bimanual.disturbances import NOMINAL
+from tpgmm_evaluation.processes import run_jobs
 from tpgmm_evaluation.variants import Variant
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
@@ -129,6 +131,71 @@ class Results:
             except DataError as error:
                 say(f"{error}; it is left out")
         return results
+
+
+@dataclass(frozen=True)
+class Job:
+    """Cells that one process runs one after the other.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Those of one training, or of one environment.
+    results : Results
+        Where they are kept.
+    arguments : tuple
+        Of the function that runs them.
+    """
+
+    cells: Sequence[Cell]
+    results: Results
+    arguments: tuple[Any, ...]
+
+    @property
+    def log(self) -> Path:
+        """The file for a traceback."""
+        return self.results.folder.parent / "failures" / f"{self.cells[0].training}.txt"
+
+
+def run_cells(
+    function: Callable[..., None],
+    jobs: Sequence[Job],
+    workers: int,
+    say: Callable[[str], None],
+) -> dict[Cell, str]:
+    """Run cells by several processes; return those without a result, with the reason.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module; it writes the results of a job's cells.
+    jobs : sequence of Job
+        Of cells that are not finished.
+    workers : int
+        How many run at a time.
+    say : callable
+        Takes a line of progress.
+    """
+    pending, finished = sum(len(job.cells) for job in jobs), 0
+    began, failures = time.monotonic(), {}
+    for number, _, problem in run_jobs(function, [job.arguments for job in jobs], workers):
+        job = jobs[number]
+        job.log.unlink(missing_ok=True)
+        if problem:
+            job.log.parent.mkdir(parents=True, exist_ok=True)
+            job.log.write_text(problem, encoding="utf-8")
+        finished += len(job.cells)
+        for cell in job.cells:
+            result = job.results.read(cell)
+            if result is None:
+                failures[cell] = (problem.strip().splitlines() or ["it left no result"])[-1]
+                text = f"FAILED, {failures[cell]} (all of it in {job.log})"
+            else:
+                successes = sum(row["success"] for row in result["episodes"])
+                text = f"{successes} of {len(result['episodes'])} succeed"
+            say(f"{cell.key}: {text}")
+        say(f"[{finished}/{pending}] after {(time.monotonic() - began) / 60:.1f} min")
+    return failures
 
 
 def _read(path: Path) -> dict[str, Any]:

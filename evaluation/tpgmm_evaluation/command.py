@@ -96,6 +96,7 @@ def compare(
     """
     from lerobot_env_bimanual.disturbances import NOMINAL
     from tpgmm_evaluation import compare as module
+    from tpgmm_evaluation.benchmarks import GROUPS
     from tpgmm_evaluation.cells import parse_numbers
     from tpgmm_evaluation.settings import Settings
     from tpgmm_evaluation.variants import OPEN_LOOP
@@ -107,7 +108,7 @@ def compare(
         Settings(
             name, episodes=episodes, budget=60 * budget, demonstration_seed=demonstration_seed
         )
-        for name in _environments(env)
+        for name in _expand(env, GROUPS)
     ]
     chosen = _policies(policies)
     tried = conditions.split(",")
@@ -127,17 +128,6 @@ def compare(
     if result.failures:
         typer.echo(f"{len(result.failures)} cells failed", err=True)
         raise typer.Exit(1)
-
-
-def _environments(text: str) -> list[str]:
-    """Return the environments that are meant, each once."""
-    from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
-
-    groups = {f"suite-{robot}": list(tasks) for robot, tasks in OTHER_ROBOTS.items()}
-    others = {"aloha_state", "aloha_insertion"}.union(*groups.values())
-    groups["suite"] = [name for name in BENCHMARKS if name not in others]
-    groups["all"] = list(BENCHMARKS)
-    return _expand(text, groups)
 
 
 def _policies(text: str) -> list[str]:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, product
+from itertools import chain, groupby, product
 from pathlib import Path
 
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_evaluation.baselines import RECIPES
 from tpgmm_evaluation.benchmarks import BENCHMARKS
-from tpgmm_evaluation.cells import Cell, Results
+from tpgmm_evaluation.cells import Cell, Job, Results, run_cells
 from tpgmm_evaluation.jobs import POLICIES, record, run
-from tpgmm_evaluation.processes import run_jobs
 from tpgmm_evaluation.report.summary import Task, write_summary
 from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.variants import NAMED, Variant
@@ -102,32 +100,26 @@ def compare(
         results, total = Results(out / task.env / "cells"), total + len(cells)
         pending.append([cell for cell in cells if not results.has(cell, say)])
     say(f"{total} cells, {total - sum(map(len, pending))} of them finished before")
-    groups = []
+    jobs = []
     for task, left in zip(tasks, pending, strict=True):
-        _record(out / task.env, task, left, max(demonstrations), say)
-        groups += _by_training(out / task.env, task, left)
-    failures = _run(groups, workers, say)
+        folder = out / task.env
+        for seed in sorted({cell.seed for cell in left}):
+            say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
+            record(folder, task, max(demonstrations), seed)
+        jobs += _by_training(folder, task, left)
+    # networks first, which take long, so that no worker is idle at the end
+    jobs.sort(key=lambda job: job.cells[0].variant.base not in RECIPES)
+    failures = run_cells(run, jobs, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
     return Comparison(total - len(failures), failures)
 
 
-def _record(
-    folder: Path, task: Settings, cells: Sequence[Cell], n: int, say: Callable[[str], None]
-) -> None:
-    """Record the episodes that the trainings of cells learn from."""
-    for seed in sorted({cell.seed for cell in cells}):
-        say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
-        record(folder, task, n, seed)
-
-
-def _by_training(
-    folder: Path, task: Settings, cells: Sequence[Cell]
-) -> list[tuple[Path, Settings, list[Cell]]]:
+def _by_training(folder: Path, task: Settings, cells: Sequence[Cell]) -> list[Job]:
     """Group cells by their training, whose cells run one after the other."""
     ordered = sorted(cells, key=lambda cell: cell.training)  # stable
-    groups = groupby(ordered, key=lambda cell: cell.training)
-    return [(folder, task, list(same)) for _, same in groups]
+    groups = [list(same) for _, same in groupby(ordered, key=lambda cell: cell.training)]
+    return [Job(same, Results(folder / "cells"), (folder, task, same)) for same in groups]
 
 
 def _check(
@@ -168,30 +160,21 @@ def choose_conditions(
     UnknownNameError
         If none of them knows one.
     """
-    every = [task.benchmark().all_conditions for task in tasks]  # an unknown task ends here
-    for name in dict.fromkeys(conditions):
-        unknown = [t.env for t in tasks if name != ALL_CONDITIONS and not t.knows(name)]
+    chosen = [_known_conditions(task, conditions) for task in tasks]
+    for name in dict.fromkeys(name for name in conditions if name != ALL_CONDITIONS):
+        unknown = [t.env for t, names in zip(tasks, chosen, strict=True) if name not in names]
         if len(unknown) == len(tasks):
             tasks[0].disturb(name)  # says what it knows
         if unknown:
             say(f"{', '.join(unknown)}: not tried in {name!r}, which is unknown there")
-    return [
-        _expand_conditions(task, conditions, names)
-        for task, names in zip(tasks, every, strict=True)
-    ]
+    return chosen
 
 
-def _expand_conditions(
-    task: Settings, conditions: Sequence[str], every: Sequence[str]
-) -> list[str]:
+def _known_conditions(task: Settings, conditions: Sequence[str]) -> list[str]:
     """List the conditions that an environment knows, each once."""
-    chosen: list[str] = []
-    for name in conditions:
-        if name == ALL_CONDITIONS:
-            chosen += every
-        elif task.knows(name):
-            chosen.append(name)
-    return list(dict.fromkeys(chosen))
+    every = task.benchmark().all_conditions  # an unknown task ends here
+    names = chain.from_iterable(every if n == ALL_CONDITIONS else [n] for n in conditions)
+    return [name for name in dict.fromkeys(names) if task.knows(name)]
 
 
 def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:
@@ -237,31 +220,3 @@ def _report(
         for path in _settings_files(out)
     ]
     return write_summary(out, tasks, failures, command)
-
-
-def _run(
-    groups: Sequence[tuple[Path, Settings, list[Cell]]],
-    workers: int,
-    say: Callable[[str], None],
-) -> dict[Cell, str]:
-    """Run the cells, those of one training one after the other; return what failed."""
-    # networks first, which take long, so that no worker is idle at the end
-    groups = sorted(groups, key=lambda group: group[2][0].variant.base not in RECIPES)
-    logs = [folder / "failures" / f"{cells[0].training}.txt" for folder, _, cells in groups]
-    pending = sum(len(cells) for *_, cells in groups)
-    began, finished, failures = time.monotonic(), 0, {}
-    for number, problem in run_jobs(run, groups, workers, logs):
-        folder, _, cells = groups[number]
-        results = Results(folder / "cells")
-        finished += len(cells)
-        for cell in cells:
-            result = results.read(cell)
-            if result is None:
-                failures[cell] = problem or "it left no result"
-                text = f"FAILED, {failures[cell]} (all of it in {logs[number]})"
-            else:
-                successes = sum(row["success"] for row in result["episodes"])
-                text = f"{successes} of {len(result['episodes'])} succeed"
-            say(f"{cell.key}: {text}")
-        say(f"[{finished}/{pending}] after {(time.monotonic() - began) / 60:.1f} min")
-    return failures

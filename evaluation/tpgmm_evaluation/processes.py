@@ -7,20 +7,16 @@ import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from multiprocessing.connection import wait
-from pathlib import Path
-from typing import Any
+from multiprocessing.connection import Connection, wait
+from typing import Any, cast
 
 #: Loaded once, in the process from which all jobs fork.
 PRELOADED = "tpgmm_evaluation.jobs"
 
 
 def run_jobs(
-    function: Callable[..., None],
-    jobs: Sequence[tuple[Any, ...]],
-    workers: int,
-    logs: Sequence[Path],
-) -> Iterator[tuple[int, str | None]]:
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], workers: int
+) -> Iterator[tuple[int, Any, str]]:
     """Call a function for each job, several at a time.
 
     Parameters
@@ -31,15 +27,15 @@ def run_jobs(
         Its arguments.
     workers : int
         How many run at a time.
-    logs : sequence of Path
-        For each job, where the traceback goes if it fails.
 
     Yields
     ------
     number : int
         Of a job that has ended, in the order in which they end.
-    problem : str or None
-        In a line, if it failed.
+    value : object
+        What the function returned.
+    problem : str
+        The traceback, or how its process ended; empty if nothing failed.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
@@ -49,29 +45,49 @@ def run_jobs(
         while waiting or running:
             while waiting and len(running) < workers:
                 number, job = waiting.pop(0)
-                logs[number].unlink(missing_ok=True)
-                arguments = (function, job, logs[number])
-                process = context.Process(target=_call, args=arguments, daemon=True)
+                answer, its = context.Pipe(duplex=False)
+                process = context.Process(target=_call, args=(function, job, its), daemon=True)
                 process.start()
-                running[process.sentinel] = (number, process)
-            for sentinel in wait(list(running)):
-                number, process = running.pop(sentinel)
-                process.join()
-                yield number, _problem(process.exitcode, logs[number])
+                its.close()
+                running[answer] = number, process
+            for ready in wait(list(running)):
+                number, process = running.pop(ready)
+                try:
+                    value, problem = cast(Connection, ready).recv()
+                    process.join()
+                except EOFError:  # it died
+                    process.join()
+                    value, problem = None, f"its process ended with code {process.exitcode}"
+                yield number, value, problem
     finally:
         for _, process in running.values():
             process.terminate()
 
 
-def _call(function: Callable[..., None], job: tuple[Any, ...], log: Path) -> None:
+def call_all(
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], workers: int
+) -> list[Any]:
+    """Call a function for each job; return the values in the order of the jobs.
+
+    Raises
+    ------
+    RuntimeError
+        If one fails; with its traceback.
+    """
+    values = {}
+    for number, value, problem in run_jobs(function, jobs, workers):
+        if problem:
+            raise RuntimeError(problem)
+        values[number] = value
+    return [values[number] for number in range(len(jobs))]
+
+
+def _call(function: Callable[..., Any], job: tuple[Any, ...], answer: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        function(*job)
-    except BaseException as error:
-        log.parent.mkdir(parents=True, exist_ok=True)
-        log.write_text(traceback.format_exc(), encoding="utf-8")
-        if not isinstance(error, Exception):
-            raise
+        answer.send((function(*job), ""))
+    except BaseException:
+        answer.send((None, traceback.format_exc()))
         os._exit(1)
 
 
@@ -81,11 +97,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _problem(code: int | None, log: Path) -> str | None:
-    if code == 0:
-        return None
-    if log.exists():
-        return log.read_text(encoding="utf-8").strip().splitlines()[-1]
-    return f"its process ended with code {code}"

@@ -90,7 +90,7 @@ def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
     robot = benchmark.robot
     moved = robot.state(robot.lower.clamp(-1, 1)).jacobians.abs().sum((0, 1)) > 0
     free = [name for name, moves in zip(robot.joint_names, moved, strict=True) if not moves]
-    rest: list[Operator] = [part for part in operators if not isinstance(part, Canonical)]
+    rest: list[Operator] = [part for part in operators if not part.is_posture]
     return [*rest, Canonical(joints=tuple(free))] if free else rest
 
 

@@ -9,9 +9,9 @@ from typing import Any
 from tpgmm_control.loop.clock import Clock
 from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.trust import Trust
-from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
+from tpgmm_torch.structure.choices import ALIGNMENTS
 
 __all__ = ["ControlConfig", "EMConfig", "FusionConfig"]
 
@@ -225,6 +225,6 @@ class TrainingConfig:
         ------
         DataError
         """
-        check_choice("training.alignment", self.alignment, (*METHODS, "parts"))
+        check_choice("training.alignment", self.alignment, ALIGNMENTS)
         check_choice("training.learn_from", self.learn_from, ("measured", "commanded"))
         check_choice("training.plausibility", self.plausibility, ("warn", "error", "ignore"))

@@ -119,11 +119,8 @@ def test_a_shove_leaves_a_past_and_enough_future():
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
 def test_an_object_is_moved_to_a_place_that_is_meant(seconds):
     for seed in range(50):
-        part = Moved(seconds=seconds).draw(
-            np.random.default_rng(seed),
-            COURSE,
-            lambda step: displace_pose(POSE, step)[0] <= 0.31,
-        )
+        meant = lambda step: displace_pose(POSE, step)[0] <= 0.31  # noqa: E731
+        part = Moved(seconds=seconds).draw(np.random.default_rng(seed), COURSE, meant)
         end = part.moment + seconds
         assert end <= COURSE.grasp - 1.5 + 1e-12
         assert part.displacement(part.moment - 1e-3) is None

@@ -105,11 +105,8 @@ def test_chunks_come_over_the_wire_and_go_on(address, tmp_path):
         for turn in range(4):
             seen = name_values(state) | {"task": "shake"}
             observation = TimedObservation(time.time(), 8 * turn, seen, must_go=True)
-            stub.SendObservations(
-                send_bytes_in_chunks(
-                    pickle.dumps(observation), services_pb2.Observation, silent=True
-                )
-            )
+            sending = pickle.dumps(observation), services_pb2.Observation
+            stub.SendObservations(send_bytes_in_chunks(*sending, silent=True))
             chunk = pickle.loads(stub.GetActions(services_pb2.Empty()).data)
             assert [action.get_timestep() for action in chunk][:2] == [8 * turn, 8 * turn + 1]
             sent += [action.get_action() for action in chunk[:8]]
@@ -129,22 +126,15 @@ def test_the_client_drives_a_robot(address, tmp_path, monkeypatch):
 
     start, log = tmp_path / "start.json", tmp_path / "log.json"
     start.write_text(json.dumps(name_values(batch()[STATE][0])))
-    client = RobotClient(
-        RobotClientConfig(
-            policy_type="tpgmm",
-            pretrained_name_or_path=str(tmp_path / "policy"),
-            robot=BimanualConfig(start=start, log=log),
-            actions_per_chunk=20,
-            server_address=address,
-            task="shake",
-            fps=20,
-        )
-    )
+    config = RobotClientConfig(
+        policy_type="tpgmm", pretrained_name_or_path=str(tmp_path / "policy"), fps=20,
+        robot=BimanualConfig(start=start, log=log), actions_per_chunk=20, task="shake",
+        server_address=address,
+    )  # fmt: skip
+    client = RobotClient(config)
     assert client.start()
-    threads = [
-        threading.Thread(target=client.receive_actions, daemon=True),
-        threading.Thread(target=client.control_loop, args=("shake",), daemon=True),
-    ]
+    loops = {client.receive_actions: (), client.control_loop: ("shake",)}
+    threads = [threading.Thread(target=f, args=a, daemon=True) for f, a in loops.items()]
     for thread in threads:
         thread.start()
     began = time.monotonic()
@@ -154,9 +144,8 @@ def test_the_client_drives_a_robot(address, tmp_path, monkeypatch):
     for thread in threads:
         thread.join(30)
     client.stop()
-    sent = torch.tensor(
-        [[action[name] for name in NAMES] for action in json.loads(log.read_text())]
-    )
+    actions = json.loads(log.read_text())
+    sent = torch.tensor([[action[name] for name in NAMES] for action in actions])
     assert len(sent) >= 45  # of chunks of 20
     torch.testing.assert_close(sent[0], batch()[STATE][0], rtol=0, atol=1e-5)
     assert float((sent[-1] - sent[0]).abs().max()) > 0.1

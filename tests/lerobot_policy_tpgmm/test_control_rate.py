@@ -9,26 +9,26 @@ from tests.support.policies import act, batch, changed, fitted
 from tpgmm_torch.exceptions import DataError
 
 
-def telling(rate):
+def with_rate(rate):
     return {CONTROL_RATE: torch.full((2, 1), float(rate))}
 
 
-@pytest.mark.parametrize("told", [100, 99.95, 100.05])
-def test_the_same_rate_is_accepted(told):
-    check_rate(telling(told), 100.0)
+@pytest.mark.parametrize("rate", [100, 99.95, 100.05])
+def test_the_same_rate_is_accepted(rate):
+    check_rate(with_rate(rate), 100.0)
     check_rate({}, 100.0)  # most environments do not tell
 
 
-@pytest.mark.parametrize("told", [50, 99.8, 100.2, 200])
-def test_another_rate_is_refused(told):
-    message = rf"takes {told:g} actions per second, the policy gives 100: --policy.control_fps="
+@pytest.mark.parametrize("rate", [50, 99.8, 100.2, 200])
+def test_another_rate_is_refused(rate):
+    message = rf"takes {rate:g} actions per second, the policy gives 100: --policy.control_fps="
     with pytest.raises(DataError, match=message):
-        check_rate(telling(told), 100.0)
+        check_rate(with_rate(rate), 100.0)
 
 
 def test_a_policy_looks_at_it():
-    told, _ = rate_processors(50)
+    before, _ = rate_processors(50)
     with pytest.raises(DataError, match=r"takes 50 actions per second, the policy gives 2.\d+"):
-        act(fitted(), told(batch()), 1)
+        act(fitted(), before(batch()), 1)
     same = changed(fitted(), control_fps=50.0)
-    assert torch.equal(act(same, told(batch()), 3), act(same, batch(), 3))
+    assert torch.equal(act(same, before(batch()), 3), act(same, batch(), 3))

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 
@@ -16,12 +15,12 @@ from lerobot.rollout.configs import DAggerStrategyConfig, RolloutConfig
 from lerobot.rollout.strategies import dagger
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.lerobot_commands import PLUGINS
 from tests.support.policies import pose
 from tests.support.skills import bottle_demonstrations, small_bottle
 from tpgmm_torch import Situation
 from tpgmm_torch.exceptions import PlausibilityWarning
 
-PLUGINS = Path(__file__).parents[1] / "support" / "plugins"
 NAMES = small_bottle().kinematics_.joint_names
 JOINTS = [f"{name}.pos" for name in NAMES]
 POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
@@ -77,9 +76,9 @@ def test_a_person_corrects_and_the_policy_goes_on(tmp_path, monkeypatch):
     start = dict(zip(JOINTS, shown.joints[0].tolist(), strict=True))
     start |= dict(zip(POSE_NAMES, pose(shown.frames["bottle"]).tolist(), strict=True))
     (tmp_path / "start.json").write_text(json.dumps(start))
-    TPGMMPolicy.from_estimator(
-        model, fps=RATE, state_names=list(start), action_names=JOINTS
-    ).save_pretrained(tmp_path / "policy")
+    names = {"state_names": list(start), "action_names": JOINTS}
+    saved = TPGMMPolicy.from_estimator(model, fps=RATE, **names)
+    saved.save_pretrained(tmp_path / "policy")
 
     policy = PreTrainedConfig.from_pretrained(tmp_path / "policy")
     policy.pretrained_path = tmp_path / "policy"
@@ -87,19 +86,14 @@ def test_a_person_corrects_and_the_policy_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(rollout_context, "make_teleoperator_from_config", lambda _: person)
     monkeypatch.setattr(dagger, "precise_sleep", lambda _: None)
     monkeypatch.setattr(dagger, "log_say", lambda *_: None)
+    given = "local/rollout_corrections", "shake", tmp_path / "set", RATE
     config = RolloutConfig(
         robot=BimanualConfig(start=tmp_path / "start.json", log=tmp_path / "log.json"),
-        teleop=SimpleNamespace(type="person"),
-        policy=policy,
+        teleop=SimpleNamespace(type="person"), policy=policy, fps=RATE, task="shake",
         strategy=DAggerStrategyConfig(num_episodes=2, smooth_handover=False),
-        dataset=DatasetRecordConfig(
-            "local/rollout_corrections", "shake", tmp_path / "set", RATE, push_to_hub=False
-        ),
-        fps=RATE,
-        task="shake",
-        play_sounds=False,
-        return_to_initial_position=False,
-    )
+        dataset=DatasetRecordConfig(*given, push_to_hub=False),
+        play_sounds=False, return_to_initial_position=False,
+    )  # fmt: skip
     context = rollout_context.build_rollout_context(config, Event())
     strategy = dagger.DAggerStrategy(config.strategy)
     person.events = strategy._events

@@ -109,16 +109,16 @@ def test_several_robots_are_one_text():
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "message"),
     [
         (None, r"does not name the values of observation.state, .*--policy.state_names="),
         ([*NAMES[:16], NAMES[0]], r"'\w+' is there twice.*--policy.state_names="),
         (list(NAMES[:16]), r"16 names for 17 values.*--policy.state_names="),
     ],
 )
-def test_values_of_a_robot_are_named_by_somebody(names, told):
+def test_values_of_a_robot_are_named_by_somebody(names, message):
     state = {STATE: {"dtype": "float32", "shape": (17,), "names": names}}
-    with pytest.raises(DataError, match=told):
+    with pytest.raises(DataError, match=message):
         adopt(config(**UPPER_BODY), dataset(20, **environment(POSE), **state))
     said = config(**UPPER_BODY, state_names=list(NAMES[::-1]))
     adopt(said, dataset(20, **environment(POSE), **state))
@@ -127,10 +127,8 @@ def test_values_of_a_robot_are_named_by_somebody(names, told):
 
 @pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])
 def test_joints_are_chosen_by_patterns(joints):
-    made = draccus.parse(
-        TPGMMConfig,
-        args=["--robot=upper_body", f"--joints={joints}", "--device=cpu", "--links=[l_hand]"],
-    )
+    given = ["--robot=upper_body", f"--joints={joints}", "--device=cpu", "--links=[l_hand]"]
+    made = draccus.parse(TPGMMConfig, args=given)
     every = Robot.from_urdf(upper_body_urdf(), []).joint_names
     chosen = [*(name for name in every if name.startswith("l_")), "waist_yaw"]
     assert list(made.kinematics().joint_names) == chosen

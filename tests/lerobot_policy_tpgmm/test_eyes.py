@@ -57,13 +57,13 @@ def test_pictures_are_among_what_it_needs():
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.uint8])
 def test_it_does_what_it_does_with_the_poses_themselves(kind):
-    acting, told = seeing(**OPEN), changed(fitted(), control_fps=RATE, **OPEN)
+    acting, usual = seeing(**OPEN), changed(fitted(), control_fps=RATE, **OPEN)
     start = batch()[STATE]
     for _ in range(2):  # three pictures are looked at before it begins
         assert torch.equal(acting.select_action(observe_start(kind=kind)), start)
     for _ in range(20):
         now = acting.select_action(observe_start(kind=kind))
-        torch.testing.assert_close(now, told.select_action(batch()), rtol=0, atol=1e-5)
+        torch.testing.assert_close(now, usual.select_action(batch()), rtol=0, atol=1e-5)
     before = [source.resets for source in acting.watch.sources]
     acting.reset()
     assert torch.equal(acting.select_action(observe_start()), start)
@@ -74,10 +74,8 @@ def test_pictures_count_more_than_the_state_of_the_environment():
     acting, other = seeing(**OPEN), seeing(**OPEN)
     misled = {ENVIRONMENT: batch()[ENVIRONMENT] + 0.3}
     for _ in range(10):
-        one, two = (
-            acting.select_action(observe_start()),
-            other.select_action(observe_start() | misled),
-        )
+        one = acting.select_action(observe_start())
+        two = other.select_action(observe_start() | misled)
     assert torch.equal(one, two)
 
 
@@ -97,16 +95,15 @@ def test_robots_stand_until_all_objects_were_seen(caplog):
     with caplog.at_level("INFO"):
         for _ in range(40):
             assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
-    assert lines(caplog)[-1] == (
-        "holding before the start: robot 1 does not see 'bottle' (a hand hides it)"
-    )
+    waits = "holding before the start: robot 1 does not see 'bottle' (a hand hides it)"
+    assert lines(caplog)[-1] == waits
     for _ in range(4):
         action = acting.select_action(observe_start())
     assert not torch.equal(action, start)
     acting.reset()
-    message = r"robot 1 does not see 'bottle' \(a hand hides it\), for 5 s .*\['front'\]"
     for _ in range(round(5 * RATE)):
         assert torch.equal(acting.select_action(observe_start(lost=[1])), start)
+    message = r"robot 1 does not see 'bottle' \(a hand hides it\), for 5 s .*\['front'\]"
     with pytest.raises(DataError, match=message):
         for _ in range(3):
             acting.select_action(observe_start(lost=[1]))
@@ -152,9 +149,8 @@ def test_what_is_not_seen_for_long_holds_the_robot_and_is_told(caplog):
 def test_most_pictures_may_show_nothing():
     rng = np.random.default_rng(0)
     lost = set(np.flatnonzero(rng.random(160) < 0.7).tolist()) - {0, 1, 2}
-    torch.testing.assert_close(
-        run(seeing(), 160, lost), run(seeing(), 160, ()), rtol=0, atol=0.02
-    )
+    blind, seen = run(seeing(), 160, lost), run(seeing(), 160, ())
+    torch.testing.assert_close(blind, seen, rtol=0, atol=0.02)
 
 
 def test_a_camera_that_was_moved_holds_the_robot_with_its_reason(caplog):
@@ -172,9 +168,8 @@ def test_chunks_stand_while_nothing_can_be_trusted():
     acting = seeing(chunk_size=20)
     start = batch()[STATE][:1]
     for _ in range(2):
-        assert torch.equal(
-            acting.predict_action_chunk(observe_start(rows=1)), start[None].expand(1, 20, -1)
-        )
+        chunk = acting.predict_action_chunk(observe_start(rows=1))
+        assert torch.equal(chunk, start[None].expand(1, 20, -1))
     one = acting.predict_action_chunk(observe_start(rows=1))
     assert float((one[:, -1] - start).abs().max()) > 1e-3
     acting.watch.sources[0].problem = "camera 'front' was moved"
@@ -229,13 +224,13 @@ def test_it_remembers_the_cell_and_takes_another(tmp_path, caplog):
     other["objects"]["bottle"]["target"] = {"tag": 4, "size": 0.06}
     (tmp_path / "cell.json").write_text(json.dumps(other))
     again = load_again(tmp_path / "policy", tmp_path / "cell.json")
-    [told] = [line for line in lines(caplog) if "another cell" in line]
+    [said] = [line for line in lines(caplog) if "another cell" in line]
     for part in (
         "'front' of the cameras was moved by 20.0 mm and 0.00 deg",
         "'bottle' of the objects has another target",
         "joint 'l_elbow' is offset by +1.15 deg more",
     ):
-        assert part in told
+        assert part in said
     # joints are measured with the offsets of the other cell, and commanded without
     elbow = again.kinematics.joint_names.index("l_elbow")
     joints = again.joints.joints(batch()[STATE].double())
@@ -258,35 +253,32 @@ def test_without_its_cameras_it_reads_poses_and_keeps_the_offsets(tmp_path, no):
 
 
 def test_cells_that_do_not_fit_are_refused(tmp_path):
-    cup = {"cup": {"target": {"tag": 3, "size": 0.06}}}
-    with pytest.raises(DataError, match=r"objects \['cup'\], not \['bottle'\].*cell=none"):
-        policy(cell=cell_content(objects=cup))
-    with pytest.raises(DataError, match=r"joints \['pan', 'lift'\], this one has"):
-        policy(cell=cell_content(joints=["pan", "lift"]))
-    policy(
-        cell=cell_content(joints=[n for n in fitted().kinematics.joint_names if n[0] == "l"])
-    )
     (tmp_path / "cell.json").write_text("{")
-    with pytest.raises(DataError, match=r"cell.json is no JSON"):
-        policy(cell=str(tmp_path / "cell.json"))
-    with pytest.raises(OSError, match=r"nowhere.json"):
-        policy(cell=str(tmp_path / "nowhere.json"))
+    cup = cell_content(objects={"cup": {"target": {"tag": 3, "size": 0.06}}})
+    for cell, error, message in (
+        (cup, DataError, r"objects \['cup'\], not \['bottle'\].*cell=none"),
+        (cell_content(joints=["pan", "lift"]), DataError, r"joints \['pan', .* this one has"),
+        (str(tmp_path / "cell.json"), DataError, r"cell.json is no JSON"),
+        (str(tmp_path / "nowhere.json"), OSError, r"nowhere.json"),
+    ):
+        with pytest.raises(error, match=message):
+            policy(cell=cell)
+    left = [name for name in fitted().kinematics.joint_names if name[0] == "l"]
+    policy(cell=cell_content(joints=left))
 
 
 # Commands
 
 
-def draw_tags(folder, pose, **changed_):
+def draw_tags(folder, pose):
     """A cell with a camera above a tag, which is at a pose (7,), and the picture of that."""
     place = rigid(np.zeros(3), pose[:3])
-    cell = recorded_tags.cell_content(
-        objects={"bottle": {**recorded_tags.OBJECT, "upright": True}}, **changed_
-    )
+    objects = {"bottle": {**recorded_tags.OBJECT, "upright": True}}
+    cell = recorded_tags.cell_content(objects=objects)
     cell["cameras"]["front"]["pose"] = pose_vector(place @ BASE_FROM_CAMERA).tolist()
     (folder / "cell.json").write_text(json.dumps(cell))
-    np.save(
-        folder / "picture.npy", recorded_tags.picture({3: inverse(place) @ pose_matrix(pose)})
-    )
+    picture = recorded_tags.picture({3: inverse(place) @ pose_matrix(pose)})
+    np.save(folder / "picture.npy", picture)
     return folder / "cell.json", folder / "picture.npy"
 
 
@@ -312,9 +304,9 @@ def test_lerobot_rollout_finds_the_frames_by_itself(tmp_path):
     done, log = rollout(tmp_path, f"--policy.cell={cell}", f"--robot.picture={picture}")
     assert done.returncode == 0, done.stderr
     sent = torch.tensor([list(action.values()) for action in json.loads(log.read_text())])
-    told = changed(fitted(), control_fps=20.0)
+    usual = changed(fitted(), control_fps=20.0)
     one = {key: value[:1] for key, value in batch().items()}
-    wanted = torch.cat([told.select_action(one | {STATE: one[STATE]}) for _ in range(10)])
+    wanted = torch.cat([usual.select_action(one | {STATE: one[STATE]}) for _ in range(10)])
     # it waits for three pictures
     torch.testing.assert_close(sent[2:8], wanted[:6], rtol=0, atol=0.01)
     assert np.ptp(sent.numpy(), axis=0).max() > 0.05
@@ -341,9 +333,8 @@ def test_poses_of_a_rendered_environment_are_true():
     acting = changed(fitted(), control_fps=20.0, cell=cell)
     now, _ = env.reset(seed=3)
     for _ in range(5):
-        seen = preprocess_observation(
-            {k: v for k, v in now.items() if k != "environment_state"}
-        )
+        blind = {k: v for k, v in now.items() if k != "environment_state"}
+        seen = preprocess_observation(blind)
         now, *_ = env.step(acting.select_action(seen)[0].numpy())
         [found], true = acting.watch.poses()["bottle"], now["environment_state"]
         np.testing.assert_allclose(found[:3], true[:3], atol=2e-3)

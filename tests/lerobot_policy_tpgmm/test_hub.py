@@ -39,9 +39,8 @@ def test_lerobot_loads_the_environments_from_the_hub(hub, tmp_path):
     hub.repositories["lab/bottle"] = {"env.py": ENV.read_bytes()}
     with pytest.raises(RuntimeError, match="Refusing to execute"):
         make_env("lab/bottle")
-    made = make_env(
-        "lab/bottle", n_envs=2, trust_remote_code=True, hub_cache_dir=tmp_path / "envs"
-    )
+    options = {"trust_remote_code": True, "hub_cache_dir": tmp_path / "envs"}
+    made = make_env("lab/bottle", n_envs=2, **options)
     [vector] = made["bottle_shaking"].values()
     observation, _ = vector.reset(seed=[0, 1])
     assert observation["agent_pos"].shape == (2, 17)

@@ -17,9 +17,10 @@ from tests.support.skills import bottle_demonstrations, generator, small_bottle
 from tpgmm_control import rollout as reproduced
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration
+from tpgmm_torch.data.pose_names import POSE_PARTS
 
 NAMES = fitted().kinematics.joint_names
-PARTS = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+PARTS = [f"bottle_{part}.pos" for part in POSE_PARTS]
 POSE = dict(zip(PARTS, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True))
 
 BOTTLE = (
@@ -55,9 +56,8 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
         Demonstration(d.time, d.joints.flip(-1).rad2deg(), d.frames, names)
         for d in bottle_demonstrations()[:3]
     ]
-    save_lerobot(
-        degrees, tmp_path / "set", fps=20, task="shake", units=dict.fromkeys(names, "raw")
-    )
+    units = dict.fromkeys(names, "raw")
+    save_lerobot(degrees, tmp_path / "set", fps=20, task="shake", units=units)
     arguments = (
         "fit", tmp_path / "set", "--robot", "upper_body", "--link", "l_hand", "--link",
         "r_hand", "--units", "deg", "--rate", 5, "--alignment", "none", "--tol", 0.1,

@@ -24,14 +24,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.Plausibi
 FPS, LENGTH, CLOSINGS = 10, 60, (2.0, 2.4, 1.8, 2.9)
 AT_LINKS = {"bottle": "l_hand@close", "start": "l_hand@start"}
 OPTIONS = {
-    "robot": "upper_body",
-    "links": ["l_hand"],
-    "coordinates": ["l_gripper"],
-    "n_components": 3,
-    "random_state": 0,
-    "alignment": "events",
-    "plausibility": "ignore",
-}
+    "robot": "upper_body", "links": ["l_hand"], "coordinates": ["l_gripper"],
+    "n_components": 3, "random_state": 0, "alignment": "events", "plausibility": "ignore",
+}  # fmt: skip
 OPERATORS = ["pose:l_hand@bottle + pose:l_hand@start", "canonical"]
 
 
@@ -99,20 +94,17 @@ def test_episodes_without_the_event_are_named(tmp_path):
             learner.forward(batch)
 
 
-@pytest.mark.parametrize("told", [{}, {"close": "closing:l_gripper"}])
-def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, told):
+@pytest.mark.parametrize("events", [{}, {"close": "closing:l_gripper"}])
+def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, events):
     flags = [one + 0.5 for one in CLOSINGS]
-    episodes = [
-        replace(demonstrate(seed, closing), events={"close": flag})
-        for seed, (closing, flag) in enumerate(zip(CLOSINGS, flags, strict=True))
-    ]
+    shown = [demonstrate(seed, closing) for seed, closing in enumerate(CLOSINGS)]
+    episodes = [replace(d, events={"close": at}) for d, at in zip(shown, flags, strict=True)]
     save_lerobot(episodes, tmp_path / "set", fps=FPS, task="grip", units={"l_gripper": "raw"})
     data = dataset(tmp_path / "set", episodes=[1, 2, 3])
-    policy = trained(data, link_frames=AT_LINKS, events=told, operators=OPERATORS, **OPTIONS)
-    read = load_lerobot(
-        data.root, episodes=[1, 2, 3], robot=robot(), frames=AT_LINKS, events=told
-    )
-    when = CLOSINGS if told else flags
+    policy = trained(data, link_frames=AT_LINKS, events=events, operators=OPERATORS, **OPTIONS)
+    given = {"robot": robot(), "frames": AT_LINKS, "events": events}
+    read = load_lerobot(data.root, episodes=[1, 2, 3], **given)
+    when = CLOSINGS if events else flags
     assert [one.events["close"] for one in read] == pytest.approx(list(when[1:]), abs=0.11)
     aligned = EventAlignment(robot=robot()).fit_transform(read)
     operators = [parse_operator(OPERATORS[0]), Canonical()]

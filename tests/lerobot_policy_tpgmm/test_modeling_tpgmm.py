@@ -5,6 +5,7 @@ import torch
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support import skills
 from tests.support.carrying import carrying_model, scenes
 from tests.support.policies import (
     ENVIRONMENT,
@@ -17,25 +18,18 @@ from tests.support.policies import (
     grouped,
     played,
     policy,
+    pose,
     situations,
-)
-from tests.support.skills import (
-    HANDS,
-    bottle_model,
-    canonical,
-    hands,
-    new_handling,
-    small_bottle,
-    waves,
 )
 from tpgmm_control import Controller
 from tpgmm_control.loop.rollout import rollout
 from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
 RATE = 20.0
-STEPS = len(small_bottle().time_)
+STEPS = len(skills.small_bottle().time_)
 
 
 def predict(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
@@ -50,7 +44,7 @@ def assert_close(actions: torch.Tensor, joints: torch.Tensor, tolerance: float =
 def test_open_loop_it_is_what_the_model_predicts():
     actions = act(played(), batch(), STEPS)
     assert actions.dtype == torch.float32 and actions.shape == (2, STEPS, 17)
-    assert_close(actions, predict(small_bottle(), situations(batch())))
+    assert_close(actions, predict(skills.small_bottle(), situations(batch())))
     assert float((actions[0] - actions[1]).abs().max()) > 0.1
 
 
@@ -60,7 +54,7 @@ def test_a_start_off_the_skill_is_blended_in_as_predict_does():
     observed[STATE][0, 4] += 0.5
     actions = act(played(), observed, STEPS)
     assert_close(actions[:, 0], observed[STATE].double())
-    assert_close(actions, predict(small_bottle(), situations(observed)))
+    assert_close(actions, predict(skills.small_bottle(), situations(observed)))
 
 
 def test_after_the_end_it_holds():
@@ -70,7 +64,7 @@ def test_after_the_end_it_holds():
 
 @pytest.mark.parametrize("rate", [5.0, 12.5])
 def test_time_advances_by_the_control_rate(rate):
-    model = small_bottle()
+    model = skills.small_bottle()
     duration = float(model.time_[-1])
     time = torch.arange(0, duration, 1 / rate, dtype=torch.float64)
     actions = act(changed(played(), control_fps=rate), batch(), len(time))
@@ -117,7 +111,7 @@ def test_a_sub_environment_that_jumps_disturbs_no_other(feedback):
 
 
 def test_q_before_may_be_what_was_measured():
-    model = small_bottle()
+    model = skills.small_bottle()
     acting = policy(feedback="observation", clock="even", keep_limits=False, blend=0.0)
     generator = torch.Generator().manual_seed(0)
     frames = {"bottle": Frame(*batch()[ENVIRONMENT].double().split([3, 4], dim=-1))}
@@ -136,23 +130,19 @@ def test_q_before_may_be_what_was_measured():
 def test_objects_are_read_at_the_start_or_followed(follow):
     acting = changed(played(), follow_frames=follow)
     path = batch()[ENVIRONMENT].double()[:1].repeat(STEPS, 1)
-    path[:, :3] += 0.05 * small_bottle().time_[:, None] / small_bottle().time_[-1]
+    path[:, :3] += 0.05 * skills.small_bottle().time_[:, None] / skills.small_bottle().time_[-1]
     acting.reset()
     with torch.inference_mode():
-        actions = torch.cat(
-            [
-                acting.select_action({STATE: batch()[STATE][:1], ENVIRONMENT: at[None].float()})
-                for at in path
-            ]
-        )
+        observed = [{STATE: batch()[STATE][:1], ENVIRONMENT: at[None].float()} for at in path]
+        actions = torch.cat([acting.select_action(one) for one in observed])
     seen = path.float().double() if follow else path.float().double()[0]
     [situation] = situations({key: value[:1] for key, value in batch().items()})
     frame = Frame(seen[..., :3], seen[..., 3:])
-    moved = Situation(situation.joints, {"bottle": frame}, small_bottle().time_)
+    moved = Situation(situation.joints, {"bottle": frame}, skills.small_bottle().time_)
     # the place of an object that creeps follows it within a second
-    assert_close(actions, predict(small_bottle(), [moved])[0], 0.03 if follow else 1e-6)
+    assert_close(actions, predict(skills.small_bottle(), [moved])[0], 0.03 if follow else 1e-6)
     if follow:
-        stood = predict(small_bottle(), situations(batch()))[0]
+        stood = predict(skills.small_bottle(), situations(batch()))[0]
         assert float((actions - stood).abs().max()) > 0.06
 
 
@@ -170,10 +160,10 @@ def test_a_robot_that_stands_far_from_the_start_is_refused():
 
 
 def test_joints_alone_need_no_robot_and_no_frames():
-    model = canonical().fit(waves())
+    model = skills.canonical().fit(skills.waves())
     acting = TPGMMPolicy.from_estimator(model, **grouped(**OPEN))
     assert set(acting.config.input_features) == {STATE}
-    start = waves()[1].joints[0]
+    start = skills.waves()[1].joints[0]
     actions = act(acting, {STATE: start[None].float()}, len(model.time_))
     # from rest, accelerated as was demonstrated at most three times over
     expected = predict(model, [Situation(start.float().double())])[0]
@@ -182,18 +172,17 @@ def test_joints_alone_need_no_robot_and_no_frames():
 
 
 def test_tracked_bodies_are_moved_on_their_manifold():
-    situation, _ = new_handling()
-    acting = TPGMMPolicy.from_estimator(hands(), **grouped(largest_start_gap=None, **OPEN))
+    situation, _ = skills.new_handling()
+    acting = TPGMMPolicy.from_estimator(
+        skills.hands(), **grouped(largest_start_gap=None, **OPEN)
+    )
     cup = situation.frames["cup"]
-    observed = {
-        STATE: situation.joints[None].float(),
-        ENVIRONMENT: torch.cat([cup.position, cup.orientation])[None].float(),
-    }
-    actions = act(acting, observed, len(hands().time_))[0]
+    observed = {STATE: situation.joints[None].float(), ENVIRONMENT: pose(cup)[None].float()}
+    actions = act(acting, observed, len(skills.hands().time_))[0]
     at = observed[ENVIRONMENT][0].double()
     given = Situation(observed[STATE][0].double(), {"cup": Frame(at[:3], at[3:])})
-    assert_close(actions, predict(hands(), [given])[0])
-    for start in HANDS.quaternion_starts:
+    assert_close(actions, predict(skills.hands(), [given])[0])
+    for start in skills.HANDS.quaternion_starts:
         norms = actions[:, start : start + 4].norm(dim=-1)
         torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
 
@@ -224,11 +213,11 @@ def as_it_is(step, now):
 
 
 def test_a_robot_that_follows_is_moved_as_in_open_loop():
-    steps = round(float(small_bottle().time_[-1]) * RATE)
+    steps = round(float(skills.small_bottle().time_[-1]) * RATE)
     # followed frames differ in the last bit, which this coarse model makes much of
     actions = run(close_loop(follow_frames=False), steps, as_it_is)
     assert_close(actions, act(changed(played(), control_fps=RATE), batch(), steps).double())
-    wanted = predict(small_bottle(), situations(batch()))
+    wanted = predict(skills.small_bottle(), situations(batch()))
     assert_close(run(changed(fitted(), joint_timeout=1.0), STEPS, as_it_is), wanted)
 
 
@@ -263,15 +252,13 @@ def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what, caplog):
 
 
 def test_timestamps_tell_how_much_time_has_passed():
-    def told(period):
-        return lambda step, now: {
-            **now,
-            "observation.timestamp": torch.full((2, 1), step * period, dtype=torch.float64),
-        }
+    def stamp(step, now):
+        time = torch.full((2, 1), step * period, dtype=torch.float64)
+        return {**now, "observation.timestamp": time}
 
     for period in (2 / RATE, 1 / (2 * RATE)):
         wanted = run(changed(close_loop(), control_fps=1 / period), 12, as_it_is)
-        assert_close(run(close_loop(), 12, told(period)), wanted.double())
+        assert_close(run(close_loop(), 12, stamp), wanted.double())
 
 
 # Chunks
@@ -296,13 +283,13 @@ def test_chunks_go_on_from_where_the_robot_is():
     assert_close(actions[:30], whole[0, :30].double(), 1e-3)
 
 
-@pytest.mark.parametrize("told", ["timestamp", "left over"])
-def test_what_tells_the_step_counts_more_than_the_posture(told):
+@pytest.mark.parametrize("source", ["timestamp", "left over"])
+def test_what_tells_the_step_counts_more_than_the_posture(source):
     acting = close_loop(chunk_size=20)
     chunk = acting.predict_action_chunk({**alone(), "observation.timestamp": torch.zeros(1, 1)})
     now = {**alone(), STATE: chunk[0, 3:4]}  # the robot lags behind the seventh action
     more = {}
-    if told == "timestamp":
+    if source == "timestamp":
         now["observation.timestamp"] = torch.full((1, 1), 7 / RATE)
     else:
         more = {"inference_delay": 0, "prev_chunk_left_over": chunk[0, 7:]}
@@ -319,19 +306,15 @@ class Mine(Canonical):
 
 def test_estimators_that_cannot_be_written_are_refused():
     with pytest.raises(NotFittedError, match="call fit"):
-        TPGMMPolicy.from_estimator(bottle_model())
-    model = canonical(operators=[Mine()]).fit(waves())
+        TPGMMPolicy.from_estimator(skills.bottle_model())
+    model = skills.canonical(operators=[Mine()]).fit(skills.waves())
     with pytest.raises(ModelFileError, match="'Mine', which is not known here"):
         TPGMMPolicy.from_estimator(model)
 
 
 def test_what_is_held_is_part_of_the_policy(tmp_path):
     model, scene = carrying_model(), scenes(2, seed=9)
-    names = [
-        f"{frame}.{part}"
-        for frame in ("bottle", "tray")
-        for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
-    ]
+    names = [f"{frame}.{part}" for frame in ("bottle", "tray") for part in POSE_PARTS]
     loop = {"clock": "even", "closed_loop": False, "smoothing": None}
     policy = TPGMMPolicy.from_estimator(model, environment_names=names, **grouped(**loop))
     policy.save_pretrained(tmp_path)
@@ -339,9 +322,8 @@ def test_what_is_held_is_part_of_the_policy(tmp_path):
     assert loaded.to_estimator().holds_ == model.holds_
     poses = [x for f in scene.frames.values() for x in (f.position, f.orientation)]
     seen = {STATE: scene.start.float(), ENVIRONMENT: torch.cat(poses, -1).float()}
-    controller = Controller(
-        model.skill, scene.start, scene.frames, **policy.config.control.options()
-    )
+    options = policy.config.control.options()
+    controller = Controller(model.skill, scene.start, scene.frames, **options)
     for now in model.time_.tolist():
         actions = loaded.select_action(seen)
         controller.step(1 / policy.config.rate)

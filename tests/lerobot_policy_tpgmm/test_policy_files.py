@@ -21,14 +21,9 @@ from tests.support.skills import same, small_bottle
 from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError
 from tpgmm_torch.persistence import load
 
-FILES = {
-    "config.json",
-    "digests.json",
-    "model/config.json",
-    "model/model.safetensors",
-    "policy_preprocessor.json",
-    "policy_postprocessor.json",
-}
+FILES = {"config.json", "digests.json", "model/config.json", "model/model.safetensors"}
+FILES |= {"policy_preprocessor.json", "policy_postprocessor.json"}
+OTHER = {"dtype": "float32", "shape": (14,), "names": None}
 DEVICE = {
     "device_processor": {"device": "cpu"},
     "rename_observations_processor": {"rename_map": {}},
@@ -86,10 +81,8 @@ def test_an_interrupted_save_leaves_what_was_there(directory, monkeypatch):
 
 
 def test_the_pipelines_around_it_change_nothing(saved):
-    pipelines = make_pre_post_processors(
-        fitted().config, pretrained_path=str(saved), preprocessor_overrides=DEVICE
-    )
-    before, after = pipelines
+    given = {"pretrained_path": str(saved), "preprocessor_overrides": DEVICE}
+    before, after = make_pre_post_processors(fitted().config, **given)
     observed = {**batch(), "task": ["shake"] * 2}
     with torch.inference_mode():
         fitted().reset()
@@ -120,10 +113,6 @@ def test_a_policy_of_release_0_3_with_options_of_gradient_steps_runs(directory, 
 # What is refused at load
 
 
-def loaded_alone(path):
-    return loaded(path, env_cfg=make_env_config("bottle_shaking"))
-
-
 @pytest.mark.parametrize("release", [{"type": "tpgmm", "n_steps": 30}, {"type": "tpgmm"}])
 def test_a_policy_of_an_earlier_release_has_to_be_fitted_again(tmp_path, release):
     (tmp_path / "config.json").write_text(json.dumps(release))
@@ -143,7 +132,7 @@ def test_a_truncated_file_is_refused(directory, keep):
         TPGMMPolicy.from_pretrained(directory)
     file.unlink()
     with pytest.raises(ModelFileError, match="is missing"):
-        loaded_alone(directory)
+        loaded(directory, env_cfg=make_env_config("bottle_shaking"))
     shutil.rmtree(directory / "model")
     with pytest.raises(ModelFileError, match="saved before it was fitted"):
         TPGMMPolicy.from_pretrained(directory)
@@ -166,9 +155,8 @@ def test_a_configuration_of_something_else_is_refused(directory, field, value, m
 
 
 def test_settings_of_a_fitted_policy_can_be_changed(directory):
-    wide = loaded(
-        directory, "--fusion.prior_std=0.01", env_cfg=make_env_config("bottle_shaking")
-    )
+    env = make_env_config("bottle_shaking")
+    wide = loaded(directory, "--fusion.prior_std=0.01", env_cfg=env)
     assert wide.to_estimator().skill.fusion.prior_std == 0.01
     same(wide.to_estimator(), small_bottle(), 1e-12)
 
@@ -216,10 +204,7 @@ def test_the_data_set_of_the_fit_is_accepted(saved):
         ({"fps": 50}, r"has 50 steps .* was made for 2\.\d+: resample.*--rate 2"),
         ({"names": fitted().kinematics.joint_names[::-1]}, r"--policy.state_names='\[...\]'"),
         ({"names": ("a", "b", "c")}, r"entries \['a', 'b', 'c'\], the policy was made for"),
-        (
-            {"action": {"dtype": "float32", "shape": (14,), "names": None}},
-            r"17 entries, but the environment or data set has a feature of shape \(14,\)",
-        ),
+        ({"action": OTHER}, r"17 entries, but the .* data set has a feature of shape \(14,\)"),
     ],
     ids=["rate", "order", "joints", "size"],
 )

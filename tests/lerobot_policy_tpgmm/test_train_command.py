@@ -90,9 +90,8 @@ def test_more_steps_and_a_resumed_run_change_nothing(folder, log, n_steps):
         folder, f"--config_path={checkpoint / 'train_config.json'}", "--resume=true",
         f"--steps={end}", "--eval_steps=1",
     )  # fmt: skip
-    assert (
-        set(read_figures(resumed, "loss")) == set(read_figures(resumed, "eval_loss")) == {0.0}
-    )
+    losses = (set(read_figures(resumed, name)) for name in ("loss", "eval_loss"))
+    assert [*losses] == [{0.0}] * 2
     assert "more steps change nothing" in resumed and "components fitted" not in resumed
     fitted = load_checkpoint(folder, n_steps).to_estimator()
     for step in (n_steps + 1, end):

@@ -60,18 +60,15 @@ def test_a_case_can_be_measured_alone_and_others_do_not_exist(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("asked", "ours", "reached"),
-    [
-        (Asked("faster", 5), 2.0, True),
-        (Asked("faster", 5), 2.1, False),
-        (Asked("times", 1.5), 15.0, True),
-        (Asked("times", 1.5), 15.1, False),
-        (Asked("most", 3), 3.0, True),
-        (Asked("most", 3), 3.1, False),
-        (None, 3.0, None),
-    ],
-)
+@pytest.mark.parametrize(("asked", "ours", "reached"), [
+    (Asked("faster", 5), 2.0, True),
+    (Asked("faster", 5), 2.1, False),
+    (Asked("times", 1.5), 15.0, True),
+    (Asked("times", 1.5), 15.1, False),
+    (Asked("most", 3), 3.0, True),
+    (Asked("most", 3), 3.1, False),
+    (None, 3.0, None),
+])  # fmt: skip
 def test_rows_say_whether_a_figure_was_reached(asked, ours, reached):
     row = Row("work", "s", ours, "other", 10.0, asked)
     assert row.is_reached is reached

@@ -90,15 +90,15 @@ class Ceiling:
 
 #: Lower them with the code; an entry goes when its budget is reached.
 CEILINGS: dict[str, Ceiling] = {
-    "lines of tpgmm_torch": Ceiling(11914, "0.4.0"),
-    "lines of tpgmm_control": Ceiling(4398, "0.4.0"),
-    "lines of tpgmm_datasets": Ceiling(4535, "0.4.0"),
-    "lines of tpgmm_vision": Ceiling(2715, "0.4.0"),
-    "lines of tpgmm_tools": Ceiling(3569, "0.4.0"),
-    "lines of lerobot_env_bimanual": Ceiling(5472, "0.4.0"),
-    "lines of tpgmm_evaluation": Ceiling(4809, "0.4.0"),
-    "lines of benchmarks": Ceiling(1634, "0.4.0"),
-    "lines of tests": Ceiling(35500, "0.4.0"),
+    "lines of tpgmm_torch": Ceiling(11686, "0.4.0"),
+    "lines of tpgmm_control": Ceiling(4391, "0.4.0"),
+    "lines of tpgmm_datasets": Ceiling(4392, "0.4.0"),
+    "lines of tpgmm_vision": Ceiling(2555, "0.4.0"),
+    "lines of tpgmm_tools": Ceiling(3371, "0.4.0"),
+    "lines of lerobot_env_bimanual": Ceiling(5313, "0.4.0"),
+    "lines of tpgmm_evaluation": Ceiling(4697, "0.4.0"),
+    "lines of benchmarks": Ceiling(1556, "0.4.0"),
+    "lines of tests": Ceiling(34340, "0.4.0"),
     # the loop will be rewritten for one robot
     "complex functions of run": Ceiling(6, "0.4.0"),
     "participles of run": Ceiling(56, "0.4.0"),

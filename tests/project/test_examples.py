@@ -18,172 +18,131 @@ RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
 
 #: For each script how many figures it draws, and what its text states, of its variables.
 CLAIMS = {
-    "plot_01_planar_arm.py": (1, lambda v: max(v["misses"]) < 2),
+    "plot_01_planar_arm.py": (1, "max(misses) < 2"),
     "plot_02_frames_without_a_robot.py": (
         1,
-        lambda v: (
-            max(v["misses"]["both frames"]) < 10
-            and v["misses"]["box alone"][1] > 333
-            and v["misses"]["socket alone"][0] > 333
-        ),
+        "max(misses['both frames']) < 10",
+        "misses['box alone'][1] > 333",
+        "misses['socket alone'][0] > 333",
     ),
     "plot_03_orientation_sign.py": (
         1,
-        lambda v: (
-            max(v["errors"]["four plain numbers"]) > 90
-            and max(v["errors"]["an orientation"]) < 10
-            and max(v["degrees_off"](one).max() for one in v["recordings"]) < 17
-        ),
+        "max(errors['four plain numbers']) > 90",
+        "max(errors['an orientation']) < 10",
+        "max(degrees_off(one).max() for one in recordings) < 17",
     ),
-    "plot_04_competing_constraints.py": (
-        1,
-        lambda v: v["shares"]["grasp"] < 0.05 and v["shares"]["shake"] > 0.5,
-    ),
+    "plot_04_competing_constraints.py": (1, "shares['grasp'] < 0.05", "shares['shake'] > 0.5"),
     "plot_05_two_hands.py": (
         2,
-        lambda v: (
-            v["errors"]["stacked"][1] < 2
-            and v["errors"]["stacked"][2] < 0.1
-            and min(e[1] for name, e in v["errors"].items() if name != "stacked") > 35
-            and min(e[7] for name, e in v["errors"].items() if name != "stacked") > 5
-        ),
+        "errors['stacked'][1] < 2",
+        "errors['stacked'][2] < 0.1",
+        "min(e[1] for name, e in errors.items() if name != 'stacked') > 35",
+        "min(e[7] for name, e in errors.items() if name != 'stacked') > 5",
     ),
     "plot_06_choosing.py": (
         1,
-        lambda v: (
-            v["best"] == "room and tray"
-            and v["errors"]["room and tray"][3] < 25
-            and min(v["errors"]["room"] + v["errors"]["tray"]) > 75
-            and v["errors"]["room and tray"][4] > 0.9 * v["errors"]["room and tray"][3]
-            and bool((np.diff(v["bic"])[:2] < 0).all())
-            and abs(v["bic"][3] / v["bic"][2] - 1) < 0.01
-            and max(v["misses"]["room and tray"][2:] + v["misses"]["tray"][2:]) < 4
-            and v["misses"]["room and tray"][1] > 15
-            and v["errors"]["tray"][4] > 90
-        ),
+        "best == 'room and tray'",
+        "errors['room and tray'][3] < 25",
+        "min(errors['room'] + errors['tray']) > 75",
+        "errors['room and tray'][4] > 0.9 * errors['room and tray'][3]",
+        "(np.diff(bic)[:2] < 0).all()",
+        "abs(bic[3] / bic[2] - 1) < 0.01",
+        "max(misses['room and tray'][2:] + misses['tray'][2:]) < 4",
+        "misses['room and tray'][1] > 15",
+        "errors['tray'][4] > 90",
     ),
-    "plot_07_lerobot_dataset.py": (1, lambda v: 0.5 < v["error"] / v["typical"] < 2),
+    "plot_07_lerobot_dataset.py": (1, "0.5 < error / typical < 2"),
     "plot_08_alignment.py": (
         1,
-        lambda v: (
-            max(s for n, s in v["spreads"].items() if "warped" in n)
-            < v["spreads"]["time stretched"] / 5
-        ),
+        "max(s for n, s in spreads.items() if 'warped' in n) < spreads['time stretched'] / 5",
     ),
-    "plot_09_covariance_along_the_path.py": (
-        1,
-        lambda v: v["at_end"] > 3 * v["at_gate"] and 0.9 < v["ratio"] < 1.1,
-    ),
+    "plot_09_covariance_along_the_path.py": (1, "at_end > 3 * at_gate", "0.9 < ratio < 1.1"),
     "plot_10_own_operator.py": (
         1,
-        lambda v: (
-            v["errors"]["with the distance"] < 5
-            and v["errors"]["joints alone"] > 10
-            and abs(float(v["change"] - v["predicted"])) < 1e-9
-        ),
+        "errors['with the distance'] < 5",
+        "errors['joints alone'] > 10",
+        "abs(float(change - predicted)) < 1e-9",
     ),
     "plot_11_what_matters.py": (
         1,
-        lambda v: (
-            v["model"].frame_names_ == ("cup", "tray")
-            and v["selection"].support_.sum() == 3
-            # the cup while the hand rests at it, the tray at the end
-            and [
-                v["selection"].candidates_[int(v["selection"].relevance_[k].argmax())].frame
-                for k in (22, -1)
-            ]
-            == ["cup", "tray"]
-        ),
+        "model.frame_names_ == ('cup', 'tray')",
+        "selection.support_.sum() == 3",
+        # the cup while the hand rests at it, the tray at the end
+        "selection.candidates_[int(selection.relevance_[22].argmax())].frame == 'cup'",
+        "selection.candidates_[int(selection.relevance_[-1].argmax())].frame == 'tray'",
     ),
     "plot_12_parts.py": (
         2,
-        lambda v: (
-            v["segmentation"].reasons_ == ("stop", "stop")
-            and v["off"] < 0.3
-            and [len(part.operators) for part in v["skill"].skills] == [2, 3, 2]
-            and v["skill"].frame_names == ("cup", "tray")
-            and max(v["least"].values()) < 10
-        ),
+        "segmentation.reasons_ == ('stop', 'stop')",
+        "off < 0.3",
+        "[len(part.operators) for part in skill.skills] == [2, 3, 2]",
+        "skill.frame_names == ('cup', 'tray')",
+        "max(least.values()) < 10",
     ),
     "plot_13_two_ways.py": (
         1,
-        lambda v: (
-            v["ways"].labels_.tolist() == [0, 1, 0, 0, 1, 1, 0, 1, 1, 0]
-            and min(v["passed"]["two ways"]) > 9
-            and np.median(v["passed"]["single model"]) < 6
-        ),
+        "ways.labels_.tolist() == [0, 1, 0, 0, 1, 1, 0, 1, 1, 0]",
+        "min(passed['two ways']) > 9",
+        "np.median(passed['single model']) < 6",
     ),
     "plot_14_corrections.py": (
         1,
-        lambda v: (
-            abs(float(v["through"].joints[np.abs(v["time"] - 2).argmin(), 0]) - 0.5) < 0.05
-            and all(abs(float(p.time[0]) - 2.5) < 0.1 for p in v["placed"])
-            and 0.05 < float((v["before"].joints - v["after"].joints).max()) < 0.3
-        ),
+        "abs(float(through.joints[np.abs(time - 2).argmin(), 0]) - 0.5) < 0.05",
+        "all(abs(float(p.time[0]) - 2.5) < 0.1 for p in placed)",
+        "0.05 < float((before.joints - after.joints).max()) < 0.3",
     ),
     "plot_15_few_demonstrations.py": (
         2,
-        lambda v: (
-            v["strongest"][0] > 0.7
-            and v["strongest"]["auto"] < 0.01
-            and v["strongest"]["many"] < 0.25
-            and v["errors"]["auto"][1:].max() < 4
-            and np.median(v["errors"]["auto"][0]) > 100
-            and np.median(v["errors"][0][:3]) > 100
-            and v["errors"][0][-1].max() < 4 < v["errors"][0][-2].min()
-        ),
+        "strongest[0] > 0.7",
+        "strongest['auto'] < 0.01",
+        "strongest['many'] < 0.25",
+        "errors['auto'][1:].max() < 4",
+        "np.median(errors['auto'][0]) > 100",
+        "np.median(errors[0][:3]) > 100",
+        "errors[0][-1].max() < 4 < errors[0][-2].min()",
     ),
     "plot_16_orientations_far_apart.py": (
         1,
-        lambda v: (
-            v["errors"]["quaternion"][:2].max() < 0.6
-            and v["errors"]["quaternion"][-1].max() > 45
-            and v["errors"]["tangent"].max() < 0.05
-            and v["degrees"][1] < 120 < v["degrees"][2]
-        ),
+        "errors['quaternion'][:2].max() < 0.6",
+        "errors['quaternion'][-1].max() > 45",
+        "errors['tangent'].max() < 0.05",
+        "degrees[1] < 120 < degrees[2]",
     ),
     "plot_17_new_to_me.py": (
         1,
-        lambda v: (
-            (v["inside"] > 1).mean() < 2 / 9
-            and not v["fails"][v["novelty"] <= 1].any()
-            and 0.05 < v["fails"][v["novelty"] > 1].mean() < 0.5
-            and v["record"][:20, 2].max() < 0.5
-            and v["record"][-1, 2] > 1.5
-        ),
+        "(inside > 1).mean() < 2 / 9",
+        "not fails[novelty <= 1].any()",
+        "0.05 < fails[novelty > 1].mean() < 0.5",
+        "record[:20, 2].max() < 0.5",
+        "record[-1, 2] > 1.5",
     ),
     "plot_18_which_goes_first.py": (
         1,
-        lambda v: (
-            np.median(v["found"]["the tip first"][..., 0], axis=1).max() < 2
-            and np.median(v["found"]["the tip first"][-1, :, 1]) > 90
-            and v["found"]["compromise"][:3, :, :2].max() < 5
-            and np.median(v["found"]["compromise"][-1, :, 0]) > 50
-            and 0 < (v["found"]["the tip first"][..., 0] > 20).sum() < 6
-            and np.median(v["found"]["the tip first"][2:, :, 2]) > 2.9
-        ),
+        "np.median(found['the tip first'][..., 0], axis=1).max() < 2",
+        "np.median(found['the tip first'][-1, :, 1]) > 90",
+        "found['compromise'][:3, :, :2].max() < 5",
+        "np.median(found['compromise'][-1, :, 0]) > 50",
+        "0 < (found['the tip first'][..., 0] > 20).sum() < 6",
+        "np.median(found['the tip first'][2:, :, 2]) > 2.9",
     ),
     "plot_19_contact.py": (
         1,
-        lambda v: (
-            v["model"].operators_[-1].axes == (2,)
-            and max(abs(v["pressed"]["with admittance", e] - 8) for e in (-5, 0, 5)) < 0.2
-            and v["pressed"]["positions alone", -5] == 0
-            and v["pressed"]["positions alone", 5] > 15
-        ),
+        "model.operators_[-1].axes == (2,)",
+        "max(abs(pressed['with admittance', e] - 8) for e in (-5, 0, 5)) < 0.2",
+        "pressed['positions alone', -5] == 0",
+        "pressed['positions alone', 5] > 15",
     ),
     "plot_20_obstacles.py": (
         1,
-        lambda v: v["distances"]["alone"].min() < -20 and v["distances"]["around"].min() > 5,
+        "distances['alone'].min() < -20",
+        "distances['around'].min() > 5",
     ),
     "plot_21_try_again.py": (
         1,
-        lambda v: (
-            (np.diff(v["progress"]) < 0).sum() == 2
-            and np.linalg.norm(v["cup"] - v["tray"]) < 0.01
-            and np.linalg.norm(v["hand"] - v["START"]) < 0.02
-            and set(v["status"]) == {"running", "waiting"}
-        ),
+        "(np.diff(progress) < 0).sum() == 2",
+        "np.linalg.norm(cup - tray) < 0.01",
+        "np.linalg.norm(hand - START) < 0.02",
+        "set(status) == {'running', 'waiting'}",
     ),
 }
 
@@ -243,9 +202,10 @@ def test_no_picture_has_colours_of_matplotlib(folder):
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_an_example_draws_and_its_text_is_true(script, pyplot, monkeypatch):
-    figures, holds = CLAIMS[script]
+    figures, *claims = CLAIMS[script]
     variables = run(script, monkeypatch)
-    assert holds(variables)
+    for claim in claims:
+        assert eval(claim, {"np": np} | variables), claim
     numbers = pyplot.get_fignums()
     assert len(numbers) == figures
     assert all(drawn(pyplot.figure(number)) for number in numbers)

@@ -1,6 +1,7 @@
 """Saves that are killed, or come at the same time: the old or the new, whole, and none lost."""
 
 import copy
+import itertools
 import os
 import time
 
@@ -24,8 +25,9 @@ def left_alone(path):
     return [item.name for item in path.parent.iterdir()] == [path.name]
 
 
-def test_models(tmp_path):
-    path, model = tmp_path / "model", copy.deepcopy(skills.hands())
+def numbered(path):
+    """Give what saves a model of a number, and what loads it, whole, and tells its number."""
+    model = copy.deepcopy(skills.hands())
     mean = model.means_[0].clone()
 
     def save(number):
@@ -37,6 +39,12 @@ def test_models(tmp_path):
         assert torch.equal(found.means_[0], mean + found.n_iter_)
         return found.n_iter_
 
+    return save, load
+
+
+def test_models(tmp_path):
+    path = tmp_path / "model"
+    save, load = numbered(path)
     killed_between(save, load, KILLS)
     save(10**6)
     assert left_alone(path)
@@ -133,38 +141,32 @@ def test_a_lock_goes_with_its_process(tmp_path):
 
 
 def test_who_reads_while_it_is_saved_has_the_old_or_the_new(tmp_path):
-    path, model = tmp_path / "model", copy.deepcopy(skills.hands())
-    mean, enough = model.means_[0].clone(), tmp_path / "enough"
+    save, load = numbered(tmp_path / "model")
+    enough = tmp_path / "enough"
 
-    def save():
-        number = 0
-        while not enough.exists():
-            number += 1
-            model.n_iter_, model.means_[0] = number, mean + number
-            persistence.save(model, path)
+    def save_on():
+        for number in itertools.count(1):
+            if enough.exists():
+                return
+            save(number)
 
-    model.n_iter_ = 0
-    persistence.save(model, path)
-    pid, seen = forked(save), set()
+    save(0)
+    pid, seen = forked(save_on), set()
     while len(seen) < 5:  # however slowly either of them gets a processor
-        found = load_model(path)
-        assert torch.equal(found.means_[0], mean + found.n_iter_)
-        seen.add(found.n_iter_)
+        seen.add(load())
     enough.touch()
     assert exit_code(pid) == 0
 
 
 def test_savers_of_one_model_leave_a_whole_one(tmp_path):
-    path, model = tmp_path / "model", copy.deepcopy(skills.hands())
-    mean = model.means_[0].clone()
+    path = tmp_path / "model"
+    save, load = numbered(path)
 
-    def save(number):
-        model.n_iter_, model.means_[0] = number, mean + number
+    def save_often(number):
         for _ in range(10):
-            persistence.save(model, path)
+            save(number)
 
-    pids = [forked(lambda number=number: save(number)) for number in range(4)]
+    pids = [forked(lambda number=number: save_often(number)) for number in range(4)]
     assert [exit_code(pid) for pid in pids] == [0] * 4
-    found = load_model(path)
-    assert torch.equal(found.means_[0], mean + found.n_iter_)
+    load()
     assert left_alone(path)

@@ -38,7 +38,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 # folders. A room may import from those on the floors before its own, and from no other.
 ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
-        ("exceptions",),
+        ("exceptions", "late"),
         ("atomic", "constraints", "quaternions", "gaussians"),
         ("data",),
         ("robots", "alignment", "mixture"),
@@ -77,7 +77,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("calibration",),
     ),
     "tpgmm_tools": (
-        ("plotting", "contacts"),
+        ("plotting",),
         ("viewing", "paper"),
         ("report", "arguments"),
         ("cli",),
@@ -128,7 +128,6 @@ LATE = {
     "mujoco",
     "pandas",
     "pyarrow",
-    "rerun",
     "tpgmm_datasets",
     "trimesh",
     "viser",

@@ -115,21 +115,17 @@ def test_what_never_came_is_nowhere_and_says_so(source, port):
     assert np.isnan(poses(source)["cup"].pose).all()
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        b"rubbish",
-        b"\xff\xfe",
-        {"object": "cup"},
-        [1, 2],
-        CUP | {"pose": [0.4, 0.1, 0.02, 1, 1, 0, 0]},
-        CUP | {"pose": [0.4, 0.1, None, 1, 0, 0, 0]},
-        CUP | {"std": [0.002]},
-        CUP | {"std": [0.002, -1]},
-        CUP | {"object": ["cup"]},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("message", [
+    b"rubbish",
+    b"\xff\xfe",
+    {"object": "cup"},
+    [1, 2],
+    CUP | {"pose": [0.4, 0.1, 0.02, 1, 1, 0, 0]},
+    CUP | {"pose": [0.4, 0.1, None, 1, 0, 0, 0]},
+    CUP | {"std": [0.002]},
+    CUP | {"std": [0.002, -1]},
+    CUP | {"object": ["cup"]},
+], ids=str)  # fmt: skip
 def test_what_is_no_pose_stops_the_robot_and_is_shown(message, source, port):
     assert source.problem == ""
     send(port, message)

@@ -28,16 +28,13 @@ def hands(joints) -> np.ndarray:
     return np.stack([state.position(hand).numpy() for hand in EXAMPLE["HANDS"]])
 
 
-@pytest.mark.parametrize(
-    ("key", "left", "right"),
-    [
-        ("w", (1, 0, 0), (1, 0, 0)),
-        ("d", (0, -1, 0), (0, -1, 0)),
-        ("r", (0, 0, 1), (0, 0, 1)),
-        ("e", (0, -1, 0), (0, 1, 0)),
-        ("q", (0, 1, 0), (0, -1, 0)),
-    ],
-)
+@pytest.mark.parametrize(("key", "left", "right"), [
+    ("w", (1, 0, 0), (1, 0, 0)),
+    ("d", (0, -1, 0), (0, -1, 0)),
+    ("r", (0, 0, 1), (0, 0, 1)),
+    ("e", (0, -1, 0), (0, 1, 0)),
+    ("q", (0, 1, 0), (0, -1, 0)),
+])  # fmt: skip
 def test_a_key_moves_the_hands_where_it_says(key, left, right):
     leading = EXAMPLE["Teleoperation"](upper_body(), START, 0.02)
     for _ in range(10):
@@ -129,19 +126,16 @@ def virtual(monkeypatch):
     gamepad.unplug()
 
 
-@pytest.mark.parametrize(
-    ("axis", "value", "key", "far"),
-    [
-        (0, 1.0, "d", 1.0),
-        (0, -1.0, "a", 1.0),
-        (1, -1.0, "w", 1.0),
-        (1, 0.575, "s", 0.5),  # half of what is outside the dead zone
-        (2, -1.0, "j", 1.0),
-        (3, 1.0, "i", 1.0),
-        (4, 1.0, "f", 1.0),
-        (5, 1.0, "r", 1.0),
-    ],
-)
+@pytest.mark.parametrize(("axis", "value", "key", "far"), [
+    (0, 1.0, "d", 1.0),
+    (0, -1.0, "a", 1.0),
+    (1, -1.0, "w", 1.0),
+    (1, 0.575, "s", 0.5),  # half of what is outside the dead zone
+    (2, -1.0, "j", 1.0),
+    (3, 1.0, "i", 1.0),
+    (4, 1.0, "f", 1.0),
+    (5, 1.0, "r", 1.0),
+])  # fmt: skip
 def test_a_stick_stands_for_a_key_as_far_as_it_is_pushed(virtual, axis, value, key, far):
     pad = EXAMPLE["Gamepad"]()
     assert pad.pressed() == {}

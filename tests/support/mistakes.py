@@ -61,14 +61,14 @@ class Mistake:
 MISTAKES: list[Mistake] = []
 
 
+def enter(group: str, rows: list[tuple[str, str, Callable[[Path], object]]]) -> None:
+    """Enter a name, what is told, and what makes it, for each of a group."""
+    MISTAKES.extend(Mistake(group, *row) for row in rows)
+
+
 def mistake(group: str, told: str) -> Callable[[Callable[[Path], object]], object]:
     """Enter a function into the table under its own name."""
-
-    def enter(function: Callable[[Path], object]) -> object:
-        MISTAKES.append(Mistake(group, function.__name__, told, function))
-        return function
-
-    return enter
+    return lambda make: enter(group, [(make.__name__, told, make)])
 
 
 @cache
@@ -125,12 +125,21 @@ def one(change, index=2, demonstrations=None):
 
 
 def joints(factor=1.0, columns=slice(None), add=0.0):
-    def change(item):
-        values = item.joints.clone()
+    def change(values):
         values[:, columns] = values[:, columns] * factor + add
+
+    return edit(change)
+
+
+def edit(change):
+    """Change the joints of a demonstration in place of a copy of them."""
+
+    def edited(item):
+        values = item.joints.clone()
+        change(values)
         return replace(item, joints=values)
 
-    return change
+    return edited
 
 
 def bottles(change):
@@ -178,39 +187,38 @@ def multiply_state(root, factors):
 # -- units ---------------------------------------------------------------------------------
 
 
-@mistake("units", r"units: .*cannot be.*degrees")
-def all_joints_in_degrees(_):
-    learn(each(joints(DEGREES)))
-
-
-@mistake("units", r"units: .*cannot be.*degrees")
-def one_joint_in_degrees(_):
-    learn(each(joints(DEGREES, 6)))
-
-
-@mistake("units", r"units: .*hardly are.*degrees")
-def degrees_without_a_robot(_):
-    check(each(joints(DEGREES))).act()
-
-
-@mistake("units", r"units: .*cannot be")
-def joints_normalised_to_a_hundred(_):
-    learn(each(joints(60.0)))
-
-
-@mistake("units", r"units: .*cannot be")
-def joints_in_ticks(_):
-    learn(each(joints(4096 / math.tau, add=2048.0)))
-
-
-@mistake("units", r"units: .*'bottle'.*millimetres")
-def bottle_in_millimetres(_):
-    learn(each(scale_bottle(1000.0)))
-
-
-@mistake("units", r"units: .*'bottle'.*centimetres")
-def bottle_in_centimetres(_):
-    learn(each(scale_bottle(100.0)))
+enter("units", [
+    ("all_joints_in_degrees", r"units: .*cannot be.*degrees",
+     lambda _: learn(each(joints(DEGREES)))),
+    ("one_joint_in_degrees", r"units: .*cannot be.*degrees",
+     lambda _: learn(each(joints(DEGREES, 6)))),
+    ("degrees_without_a_robot", r"units: .*hardly are.*degrees",
+     lambda _: check(each(joints(DEGREES))).act()),
+    ("joints_normalised_to_a_hundred", r"units: .*cannot be",
+     lambda _: learn(each(joints(60.0)))),
+    ("joints_in_ticks", r"units: .*cannot be",
+     lambda _: learn(each(joints(4096 / math.tau, add=2048.0)))),
+    ("bottle_in_millimetres", r"units: .*'bottle'.*millimetres",
+     lambda _: learn(each(scale_bottle(1000.0)))),
+    ("bottle_in_centimetres", r"units: .*'bottle'.*centimetres",
+     lambda _: learn(each(scale_bottle(100.0)))),
+    ("offsets_of_six_radians", r"limits: .*beyond",
+     lambda _: lint(each(joints(add=4.0, columns=4)))),
+    ("start_posture_in_degrees", r"units: .*start posture.*degrees",
+     lambda _: predict(replace(usual(), joints=usual().joints * DEGREES))),
+    ("new_bottle_in_millimetres", r"place: bottle: x = \d+\.?\d*, shown",
+     lambda _: predict(scale_bottle(1000.0)(usual()))),
+    ("new_bottle_in_centimetres", r"place: bottle: x = \d+\.?\d*, shown",
+     lambda _: predict(scale_bottle(100.0)(usual()))),
+    ("a_set_in_degrees", r"not radians: .*'left_elbow'.*'right_elbow'",
+     lambda folder: load_lerobot(multiply_state(write_set(folder), 600.0))),
+    ("a_misspelt_unit", r"unit 'degree' is unknown",
+     lambda folder: load_lerobot(write_set(folder), units="degree")),
+    ("arms_in_lerobots_units_that_nobody_said", r"not radians.*'lerobot'",
+     lambda folder: load_arms(folder)),
+    ("a_pattern_that_is_misspelt", r"units names \['\*griper'\], which fit no value",
+     lambda folder: load_arms(folder, units={"*": "deg", "*griper": "raw"})),
+])  # fmt: skip
 
 
 @mistake("units", r"units: .*millimetres")
@@ -224,31 +232,6 @@ def hands_in_millimetres(_):
         frame = {"cup": Frame([0.3, 0.1 * n, 0.1])}
         items.append(Demonstration(time, np.hstack((path, turn)), frame, poses.joint_names))
     lint(items, poses)
-
-
-@mistake("units", r"limits: .*beyond")
-def offsets_of_six_radians(_):
-    lint(each(joints(add=4.0, columns=4)))
-
-
-@mistake("units", r"units: .*start posture.*degrees")
-def start_posture_in_degrees(_):
-    predict(replace(usual(), joints=usual().joints * DEGREES))
-
-
-@mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
-def new_bottle_in_millimetres(_):
-    predict(scale_bottle(1000.0)(usual()))
-
-
-@mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
-def new_bottle_in_centimetres(_):
-    predict(scale_bottle(100.0)(usual()))
-
-
-@mistake("units", r"not radians: .*'left_elbow'.*'right_elbow'")
-def a_set_in_degrees(folder):
-    load_lerobot(multiply_state(write_set(folder), 600.0))
 
 
 @mistake("units", r"(not radians|undecided).*right_elbow")
@@ -272,11 +255,6 @@ def the_quiet_episodes_of_a_set_in_degrees(folder):
     load_lerobot(folder / "set", episodes=[0, 1])
 
 
-@mistake("units", r"unit 'degree' is unknown")
-def a_misspelt_unit(folder):
-    load_lerobot(write_set(folder), units="degree")
-
-
 @mistake("units", r"units: .*millimetres")
 def a_set_with_its_bottle_in_millimetres(folder):
     demonstrations = [
@@ -290,9 +268,22 @@ def a_set_with_its_bottle_in_millimetres(folder):
 # -- time ----------------------------------------------------------------------------------
 
 
-@mistake("time", r"time: .*milliseconds")
-def time_in_milliseconds(_):
-    learn(each(change_time(lambda time: 1000 * time)))
+enter("time", [
+    ("time_in_milliseconds", r"time: .*milliseconds",
+     lambda _: learn(each(change_time(lambda time: 1000 * time)))),
+    ("time_in_minutes", r"speed: .*faster than the robot",
+     lambda _: lint(each(change_time(lambda time: time / 60)))),
+    ("one_recording_in_milliseconds", r"(time|durations|alignment): ",
+     lambda _: learn(one(change_time(lambda time: 1000 * time)))),
+    ("time_that_goes_back", r"time must increase strictly",
+     lambda _: one(change_time(lambda time: time.flip(0)))),
+    ("a_time_twice", r"time must increase strictly",
+     lambda _: one(change_time(lambda time: torch.cat((time[:5], time[4:-1]))))),
+    ("a_new_situation_in_milliseconds", r"(time|place|.*)references are wanted",
+     lambda _: predict(replace(usual(), time=1000 * shown()[0].time))),
+    ("an_event_in_milliseconds", r"outside the demonstration",
+     lambda _: replace(shown()[0], events={"grasp": 4200.0})),
+])  # fmt: skip
 
 
 @mistake("time", r"time: .*numbers of frames")
@@ -305,29 +296,9 @@ def time_in_days(_):
     lint(each(lambda item: replace(item, time=item.time / 86400, events={}), fine()))
 
 
-@mistake("time", r"speed: .*faster than the robot")
-def time_in_minutes(_):
-    lint(each(change_time(lambda time: time / 60)))
-
-
-@mistake("time", r"(time|durations|alignment): ")
-def one_recording_in_milliseconds(_):
-    learn(one(change_time(lambda time: 1000 * time)))
-
-
 @mistake("time", r"alignment: .*begin at different times")
 def clocks_that_do_not_begin_together(_):
     learn([change_time(lambda t, n=n: t + 30.0 * n)(item) for n, item in enumerate(shown())])
-
-
-@mistake("time", r"time must increase strictly")
-def time_that_goes_back(_):
-    one(change_time(lambda time: time.flip(0)))
-
-
-@mistake("time", r"time must increase strictly")
-def a_time_twice(_):
-    one(change_time(lambda time: torch.cat((time[:5], time[4:-1]))))
 
 
 @mistake("time", r"gaps: nothing was recorded for")
@@ -339,20 +310,10 @@ def a_hole_in_a_recording(_):
     lint(one(cut, demonstrations=fine()))
 
 
-@mistake("time", r"(time|place|.*)references are wanted")
-def a_new_situation_in_milliseconds(_):
-    predict(replace(usual(), time=1000 * shown()[0].time))
-
-
 @mistake("time", r"time: references are wanted from 4000")
 def a_tick_in_milliseconds(_):
     model = bottle_model(4, tol=1e6).fit(shown())
     model.step(4000.0, usual().joints, usual().frames)
-
-
-@mistake("time", r"outside the demonstration")
-def an_event_in_milliseconds(_):
-    replace(shown()[0], events={"grasp": 4200.0})
 
 
 # -- lengths -------------------------------------------------------------------------------
@@ -363,44 +324,22 @@ def unequal_lengths_without_alignment(_):
     learn([change_time(lambda t, n=n: t * (1 + n / 20))(d) for n, d in enumerate(shown())])
 
 
-@mistake("lengths", r"freedom: one demonstration")
-def a_single_demonstration(_):
-    learn(shown()[:1])
-
-
-@mistake("lengths", r"freedom: two demonstrations")
-def two_demonstrations(_):
-    learn(shown()[:2], covariance_shrinkage=0.0)
-
-
-@mistake("lengths", r"copies: .*demonstration 1 is a copy of 0")
-def copies_of_one_demonstration(_):
-    lint([shown()[0], *shown()])
-
-
-@mistake("lengths", r"durations: .*demonstration 2")
-def a_recording_that_ran_on(_):
-    lint(one(change_time(lambda time: 4 * time)))
-
-
-@mistake("lengths", r"joints has shape \(T, n_joints\) with T")
-def fewer_times_than_postures(_):
-    Demonstration(shown()[0].time[:-1], shown()[0].joints)
-
-
-@mistake("lengths", r"frame 'bottle' has leading shape")
-def fewer_poses_than_postures(_):
-    bottles(lambda frame: frame.expand((7,)))(shown()[0])
-
-
-@mistake("lengths", r"at least one demonstration")
-def no_demonstrations(_):
-    learn([])
-
-
-@mistake("lengths", r"expected a list of demonstrations, got one")
-def a_demonstration_that_is_no_list(_):
-    learn(shown()[0])
+enter("lengths", [
+    ("a_single_demonstration", r"freedom: one demonstration", lambda _: learn(shown()[:1])),
+    ("two_demonstrations", r"freedom: two demonstrations",
+     lambda _: learn(shown()[:2], covariance_shrinkage=0.0)),
+    ("copies_of_one_demonstration", r"copies: .*demonstration 1 is a copy of 0",
+     lambda _: lint([shown()[0], *shown()])),
+    ("a_recording_that_ran_on", r"durations: .*demonstration 2",
+     lambda _: lint(one(change_time(lambda time: 4 * time)))),
+    ("fewer_times_than_postures", r"joints has shape \(T, n_joints\) with T",
+     lambda _: Demonstration(shown()[0].time[:-1], shown()[0].joints)),
+    ("fewer_poses_than_postures", r"frame 'bottle' has leading shape",
+     lambda _: bottles(lambda frame: frame.expand((7,)))(shown()[0])),
+    ("no_demonstrations", r"at least one demonstration", lambda _: learn([])),
+    ("a_demonstration_that_is_no_list", r"expected a list of demonstrations, got one",
+     lambda _: learn(shown()[0])),
+])  # fmt: skip
 
 
 # -- order ---------------------------------------------------------------------------------
@@ -412,9 +351,14 @@ def unnamed_joints_arms_exchanged(_):
     lint(each(drop_names(order)))
 
 
-@mistake("order", r"(order|limits): .*limits")
-def unnamed_joints_reversed(_):
-    lint(each(drop_names(list(range(16, -1, -1)))))
+enter("order", [
+    ("unnamed_joints_reversed", r"(order|limits): .*limits",
+     lambda _: lint(each(drop_names(list(range(16, -1, -1)))))),
+    ("start_posture_in_another_order", r"(order|limits|start): ",
+     lambda _: predict(replace(usual(), joints=usual().joints.flip(0)))),
+    ("joints_transposed", r"joints has shape|joint_names needs",
+     lambda _: Demonstration(shown()[0].time, shown()[0].joints.T)),
+])  # fmt: skip
 
 
 @mistake("order", r"(order|limits|episodes): ")
@@ -422,16 +366,6 @@ def two_columns_exchanged_in_one_demonstration(_):
     order = list(range(17))
     order[4], order[6] = 6, 4
     lint(one(lambda d: replace(d, joints=d.joints[:, order])))
-
-
-@mistake("order", r"(order|limits|start): ")
-def start_posture_in_another_order(_):
-    predict(replace(usual(), joints=usual().joints.flip(0)))
-
-
-@mistake("order", r"joints has shape|joint_names needs")
-def joints_transposed(_):
-    Demonstration(shown()[0].time, shown()[0].joints.T)
 
 
 @mistake("order", r"frames: frame 'bottle'.*demonstration 2")
@@ -484,19 +418,20 @@ def two_frames():
 # -- names ---------------------------------------------------------------------------------
 
 
-@mistake("names", r"'cup' .*\['bottle'\]")
-def an_operator_on_a_frame_that_is_not_there(_):
-    learn(shown(), [RelativePosition("l_hand", "cup")])
-
-
-@mistake("names", r"'left_hand' .*l_hand")
-def an_operator_on_a_link_that_is_not_there(_):
-    learn(shown(), [RelativePosition("left_hand", "bottle")])
-
-
-@mistake("names", r"'bottle'.*\['flask'\]")
-def a_situation_with_another_name(_):
-    predict(replace(usual(), frames={"flask": usual().frames["bottle"]}))
+enter("names", [
+    ("an_operator_on_a_frame_that_is_not_there", r"'cup' .*\['bottle'\]",
+     lambda _: learn(shown(), [RelativePosition("l_hand", "cup")])),
+    ("an_operator_on_a_link_that_is_not_there", r"'left_hand' .*l_hand",
+     lambda _: learn(shown(), [RelativePosition("left_hand", "bottle")])),
+    ("a_situation_with_another_name", r"'bottle'.*\['flask'\]",
+     lambda _: predict(replace(usual(), frames={"flask": usual().frames["bottle"]}))),
+    ("another_frame_in_one_demonstration", r"demonstration 2 has frames \['cup'\]",
+     lambda _: learn(one(lambda d: replace(d, frames={"cup": d.frames["bottle"]})))),
+    ("a_robot_without_that_link", r"link 'hand' is not in the URDF",
+     lambda _: Robot.from_urdf(G1_PATH, ["hand"])),
+    ("a_set_without_names", r"does not name its 3 values.*--joint-name robot",
+     lambda folder: load_lerobot(name_values(write_set(folder), None), robot=ARM)),
+])  # fmt: skip
 
 
 @mistake("names", r"joint .* is not in the demonstration")
@@ -509,16 +444,6 @@ def joints_of_another_robot(_):
 def a_joint_named_twice(_):
     names = upper_body().joint_names
     replace(shown()[0], joint_names=(names[0], *names[:-1]))
-
-
-@mistake("names", r"demonstration 2 has frames \['cup'\]")
-def another_frame_in_one_demonstration(_):
-    learn(one(lambda d: replace(d, frames={"cup": d.frames["bottle"]})))
-
-
-@mistake("names", r"link 'hand' is not in the URDF")
-def a_robot_without_that_link(_):
-    Robot.from_urdf(G1_PATH, ["hand"])
 
 
 @mistake("names", r"event 'touch' is not in the demonstration")
@@ -556,11 +481,6 @@ def a_set_with_numbers_for_names(folder):
     load_lerobot(name_values(write_set(folder), {"motors": [0, 1, 2]}), robot=ARM)
 
 
-@mistake("names", r"does not name its 3 values.*--joint-name robot")
-def a_set_without_names(folder):
-    load_lerobot(name_values(write_set(folder), None), robot=ARM)
-
-
 @mistake("names", r"joints: 'action' is read.*measured_joints.*--joints")
 def measured_joints_under_another_name(folder):
     root, name = write_set(folder), "measured_joints"
@@ -580,39 +500,24 @@ def measured_joints_under_another_name(folder):
 # -- quaternions ---------------------------------------------------------------------------
 
 
-@mistake("quaternions", r"quaternions: .*\(x, y, z, w\)")
-def quaternions_with_w_last(_):
-    lint(each(bottles(as_xyzw)))
+enter("quaternions", [
+    ("quaternions_with_w_last", r"quaternions: .*\(x, y, z, w\)",
+     lambda _: lint(each(bottles(as_xyzw)))),
+    ("quaternion_of_a_situation_with_w_last", r"turn: bottle: .*Read as \(x, y, z, w\)",
+     lambda _: predict(bottles(as_xyzw)(usual()))),
+    ("a_quaternion_of_zeros", r"unit quaternion", lambda _: Frame([0.3, 0, 0.1], [0, 0, 0, 0])),
+    ("a_quaternion_that_is_no_unit", r"unit quaternion",
+     lambda _: Frame([0.3, 0, 0.1], [0.9, 0.3, 0.3, 0.3])),
+    ("euler_angles_for_a_quaternion", r"orientation\s+of shape",
+     lambda _: Frame([0.3, 0, 0.1], [0.1, 0.2, 0.3])),
+    ("a_matrix_for_a_quaternion", r"orientation\s+of shape",
+     lambda _: Frame([0.3, 0, 0.1], np.eye(3))),
+])  # fmt: skip
 
 
 @mistake("quaternions", r"frames: .*turned.*demonstration 2.*\(w, x, y, z\)")
 def quaternions_with_w_last_in_one_demonstration(_):
     lint(one(bottles(as_xyzw)))
-
-
-@mistake("quaternions", r"turn: bottle: .*Read as \(x, y, z, w\)")
-def quaternion_of_a_situation_with_w_last(_):
-    predict(bottles(as_xyzw)(usual()))
-
-
-@mistake("quaternions", r"unit quaternion")
-def a_quaternion_of_zeros(_):
-    Frame([0.3, 0, 0.1], [0, 0, 0, 0])
-
-
-@mistake("quaternions", r"unit quaternion")
-def a_quaternion_that_is_no_unit(_):
-    Frame([0.3, 0, 0.1], [0.9, 0.3, 0.3, 0.3])
-
-
-@mistake("quaternions", r"orientation\s+of shape")
-def euler_angles_for_a_quaternion(_):
-    Frame([0.3, 0, 0.1], [0.1, 0.2, 0.3])
-
-
-@mistake("quaternions", r"orientation\s+of shape")
-def a_matrix_for_a_quaternion(_):
-    Frame([0.3, 0, 0.1], np.eye(3))
 
 
 @mistake("quaternions", r"turn: bottle: turned by 90 deg")
@@ -632,14 +537,13 @@ def columns_of_a_pose_one_off(folder):
 # -- frames --------------------------------------------------------------------------------
 
 
-@mistake("frames", r"frames: .*demonstration 2 \(0, 0, 0\)")
-def a_tracker_that_lost_the_bottle(_):
-    lint(one(scale_bottle(0.0)))
-
-
-@mistake("frames", r"frames: .*demonstration 2")
-def another_base_in_one_demonstration(_):
-    lint(one(move_bottle(0.0, 0.8, 0.0)))
+enter("frames", [
+    ("a_tracker_that_lost_the_bottle", r"frames: .*demonstration 2 \(0, 0, 0\)",
+     lambda _: lint(one(scale_bottle(0.0)))),
+    ("another_base_in_one_demonstration", r"frames: .*demonstration 2",
+     lambda _: lint(one(move_bottle(0.0, 0.8, 0.0)))),
+    ("a_bottle_that_is_nowhere", r"NaN or infinite", lambda _: Frame([0.3, math.nan, 0.1])),
+])  # fmt: skip
 
 
 @mistake("frames", r"frames: frame 'bottle' jumps .*demonstration 2")
@@ -665,11 +569,6 @@ def a_bottle_behind_the_robot(_):
     predict(bottles(lambda f: Frame(position, f.orientation))(usual()))
 
 
-@mistake("frames", r"NaN or infinite")
-def a_bottle_that_is_nowhere(_):
-    Frame([0.3, math.nan, 0.1])
-
-
 @mistake("frames", r"place: bottle: y = 1")
 def a_tick_with_the_bottle_elsewhere(_):
     model = bottle_model(4, tol=1e6).fit(shown())
@@ -686,36 +585,20 @@ def moving(start, step):
 STILL, ONES = "episode,x,y,z", ["0,0.3,0.1,0.0", "1,0.3,0.2,0.0", "2,0.4,0.2,0.0"]
 #: A table of a cup's poses beside a set of three episodes: name, header, rows, what is told.
 MEASURED = (
-    (
-        "an_episode_without_a_pose",
-        STILL,
-        ONES[:2],
-        r"episode 2: .* 0 rows for this .*--episodes",
-    ),
-    (
-        "two_poses_for_an_episode",
-        STILL,
-        [*ONES, ONES[1]],
-        r"episode 1: .*2 rows for this .*'time'",
-    ),
-    (
-        "episodes_from_one",
-        STILL,
-        ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
-        r"episodes 3, the set has 0 to 2",
-    ),
+    ("an_episode_without_a_pose", STILL, ONES[:2],
+     r"episode 2: .* 0 rows for this .*--episodes"),
+    ("two_poses_for_an_episode", STILL, [*ONES, ONES[1]],
+     r"episode 1: .*2 rows for this .*'time'"),
+    ("episodes_from_one", STILL, ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
+     r"episodes 3, the set has 0 to 2"),
     ("episodes_by_name", STILL, ["a,0,0,0", "b,0,0,0"], r"'episode' holds no numbers"),
     ("half_episodes", STILL, ["0.5,0,0,0"], r"episodes 0.5, the set has 0 to 2"),
     ("no_rows", STILL, [], r"no rows"),
     ("no_episodes", "x,y,z", ["0,0,0"], r"columns .* Name them episode"),
     ("no_height", "episode,x,y", ["0,0.3,0.1"], r"Name them episode, x, y, z"),
     ("half_a_quaternion", f"{STILL},qx,qy,qz", ["0,0,0,0,0,0,0"], r"qw, qx, qy, qz"),
-    (
-        "two_rotations",
-        f"{STILL},yaw,yaw_deg",
-        ["0,0,0,0,0,0"],
-        r"\['yaw_deg'\] are unknown or there twice",
-    ),
+    ("two_rotations", f"{STILL},yaw,yaw_deg", ["0,0,0,0,0,0"],
+     r"\['yaw_deg'\] are unknown or there twice"),
     ("semicolons", "episode;x;y;z;up", ["0;0;0;0;1"], r"\['up'\] are unknown"),
     ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"\['score'\] are unknown"),
     ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"'mug.z'\]. Name them .*cup.x"),
@@ -727,7 +610,7 @@ MEASURED = (
     ("milliseconds", "episode,time,x,y,z", moving(0, 20), r"from 0 to 160,.*in seconds"),
     ("time_of_day", "episode,time,x,y,z", moving(1.7e9, 0.02), r"from the start of each"),
     ("no_time_goes_by", "episode,time,x,y,z", moving(0.1, 0), r"time does not increase"),
-)
+)  # fmt: skip
 
 
 def load_measured(folder, header, rows):
@@ -764,34 +647,28 @@ def the_object_for_the_hand_that_held_it(_):
 
 @mistake("values", r"wraps: .*whole turn.*demonstration 2")
 def angles_that_wrap(_):
-    def wrap(item):
-        values = item.joints.clone()
+    def wrap(values):
         values[120:, 3] -= math.tau
-        return replace(item, joints=values)
 
-    lint(one(wrap, demonstrations=fine()))
+    lint(one(edit(wrap), demonstrations=fine()))
 
 
 @mistake("values", r"jumps: .*demonstration 2")
 def a_value_that_was_lost(_):
-    def spoil(item):
-        values = item.joints.clone()
+    def spoil(values):
         values[130, 5] += 0.6
-        return replace(item, joints=values)
 
-    lint(one(spoil, demonstrations=fine()))
+    lint(one(edit(spoil), demonstrations=fine()))
 
 
 @mistake("values", r"clipped: .*stop dead")
 def values_that_were_clipped(_):
-    def clip(item):
-        values = item.joints.clone()
+    def clip(values):
         for joint in (3, 10):
             high = torch.quantile(values[:, joint], 0.85)
             values[:, joint] = values[:, joint].clamp(max=float(high))
-        return replace(item, joints=values)
 
-    lint(each(clip, fine()))
+    lint(each(edit(clip), fine()))
 
 
 @mistake("values", r"stuck: .*demonstration 2")
@@ -801,12 +678,10 @@ def a_sensor_that_is_stuck(_):
 
 @mistake("values", r"stuck: .*demonstration 2")
 def a_sensor_that_freezes_half_way(_):
-    def freeze(item):
-        values = item.joints.clone()
+    def freeze(values):
         values[80:200, 3] = values[80, 3]
-        return replace(item, joints=values)
 
-    lint(one(freeze, demonstrations=fine()))
+    lint(one(edit(freeze), demonstrations=fine()))
 
 
 @mistake("values", r"episodes: .*demonstration 2")
@@ -819,9 +694,12 @@ def a_recording_in_reverse(_):
     lint(one(lambda d: replace(d, joints=d.joints.flip(0)), demonstrations=shown()[:4]))
 
 
-@mistake("values", r"still: joints never move.*: l_elbow")
-def a_joint_that_was_not_recorded(_):
-    lint(each(joints(0.0, upper_body().joint_names.index("l_elbow"))))
+enter("values", [
+    ("a_joint_that_was_not_recorded", r"still: joints never move.*: l_elbow",
+     lambda _: lint(each(joints(0.0, upper_body().joint_names.index("l_elbow"))))),
+    ("a_posture_that_is_not_a_number", r"NaN or infinite",
+     lambda _: joints(float("nan"))(shown()[0])),
+])  # fmt: skip
 
 
 @mistake("values", r"start: start posture: .*shown")
@@ -829,11 +707,6 @@ def a_start_far_from_those_shown(_):
     start = usual().joints.clone()
     start[4] += 1.5
     predict(replace(usual(), joints=start))
-
-
-@mistake("values", r"NaN or infinite")
-def a_posture_that_is_not_a_number(_):
-    joints(float("nan"))(shown()[0])
 
 
 @mistake("values", r"events: .*'grasp' at 0%.*demonstration")
@@ -863,49 +736,26 @@ def an_event_that_is_missing(_):
 # -- shapes --------------------------------------------------------------------------------
 
 
-@mistake("shapes", r"joints has shape \(T, n_joints\)")
-def a_flat_list_of_joints(_):
-    Demonstration([0.0, 0.1], [0.0, 1.0])
-
-
-@mistake("shapes", r"position has shape \(\.\.\., 3\)")
-def a_position_in_the_plane(_):
-    Frame([0.3, 0.1])
-
-
-@mistake("shapes", r"a number for each joint, got shape")
-def a_path_for_a_start(_):
-    Situation(shown()[0].joints)
-
-
-@mistake("shapes", r"has 16 joints, the model has 17")
-def a_start_without_one_joint(_):
-    predict(replace(usual(), joints=usual().joints[:-1]))
-
-
-@mistake("shapes", r"expected a list of Demonstration, item 0 is ndarray")
-def arrays_for_demonstrations(_):
-    learn([d.joints.numpy() for d in shown()])
-
-
-@mistake("shapes", r"demonstration 2 has 16 joints")
-def one_demonstration_without_a_joint(_):
-    learn(one(lambda d: Demonstration(d.time, d.joints[:, :-1], d.frames)))
-
-
-@mistake("shapes", r"Situation objects, got Frame")
-def frames_for_situations(_):
-    learned().predict([usual().frames["bottle"]])
-
-
-@mistake("shapes", r"got 'arm\.urdf'; .*Robot\.from_urdf")
-def a_file_for_a_robot(_):
-    check(shown(), "arm.urdf")
-
-
-@mistake("shapes", r"got 'arm\.urdf'; .*Robot\.from_urdf")
-def a_file_for_the_robot_of_a_set(folder):
-    load_lerobot(write_set(folder), robot="arm.urdf")
+enter("shapes", [
+    ("a_flat_list_of_joints", r"joints has shape \(T, n_joints\)",
+     lambda _: Demonstration([0.0, 0.1], [0.0, 1.0])),
+    ("a_position_in_the_plane", r"position has shape \(\.\.\., 3\)",
+     lambda _: Frame([0.3, 0.1])),
+    ("a_path_for_a_start", r"a number for each joint, got shape",
+     lambda _: Situation(shown()[0].joints)),
+    ("a_start_without_one_joint", r"has 16 joints, the model has 17",
+     lambda _: predict(replace(usual(), joints=usual().joints[:-1]))),
+    ("arrays_for_demonstrations", r"expected a list of Demonstration, item 0 is ndarray",
+     lambda _: learn([d.joints.numpy() for d in shown()])),
+    ("one_demonstration_without_a_joint", r"demonstration 2 has 16 joints",
+     lambda _: learn(one(lambda d: Demonstration(d.time, d.joints[:, :-1], d.frames)))),
+    ("frames_for_situations", r"Situation objects, got Frame",
+     lambda _: learned().predict([usual().frames["bottle"]])),
+    ("a_file_for_a_robot", r"got 'arm\.urdf'; .*Robot\.from_urdf",
+     lambda _: check(shown(), "arm.urdf")),
+    ("a_file_for_the_robot_of_a_set", r"got 'arm\.urdf'; .*Robot\.from_urdf",
+     lambda folder: load_lerobot(write_set(folder), robot="arm.urdf")),
+])  # fmt: skip
 
 
 # -- files ---------------------------------------------------------------------------------
@@ -927,39 +777,26 @@ def stamps():
     return np.concatenate([np.arange(len(d)) / 5 for d in shown()[:2]])
 
 
-@mistake("files", r"\['clock'\] count the rows or tell the time")
-def a_table_with_a_second_clock(_):
-    demonstrations_from_frame(table_of(clock=99 + stamps()))
-
-
-@mistake("files", r"\['count'\] count the rows")
-def a_table_that_counts_in_floats(_):
-    demonstrations_from_frame(table_of(count=5 * stamps()))
-
-
-@mistake("files", r"\['progress'\] change by the same in every row")
-def a_table_with_progress(_):
-    demonstrations_from_frame(table_of(progress=stamps() / 7))
-
-
-@mistake("files", r"\['note'\] of the table are empty")
-def a_table_with_an_empty_column(_):
-    demonstrations_from_frame(table_of(note=math.nan))
-
-
-@mistake("files", r"columns of one name: \['l_elbow.1'\]")
-def a_table_with_a_column_twice(_):
-    demonstrations_from_frame(table_of(**{"l_elbow.1": stamps() ** 2}))
-
-
-@mistake("files", r"'time' holds neither numbers nor dates.*'31\.1\.26'")
-def a_table_with_another_calendar(_):
-    demonstrations_from_frame(table_of(time="31.1.26"))
-
-
-@mistake("files", r"'elbow' holds no numbers.*'0,5'.*decimal=','")
-def a_table_with_decimal_commas(_):
-    demonstrations_from_frame(table_of(elbow="0,5"))
+enter("files", [
+    ("a_table_with_a_second_clock", r"\['clock'\] count the rows or tell the time",
+     lambda _: demonstrations_from_frame(table_of(clock=99 + stamps()))),
+    ("a_table_that_counts_in_floats", r"\['count'\] count the rows",
+     lambda _: demonstrations_from_frame(table_of(count=5 * stamps()))),
+    ("a_table_with_progress", r"\['progress'\] change by the same in every row",
+     lambda _: demonstrations_from_frame(table_of(progress=stamps() / 7))),
+    ("a_table_with_an_empty_column", r"\['note'\] of the table are empty",
+     lambda _: demonstrations_from_frame(table_of(note=math.nan))),
+    ("a_table_with_a_column_twice", r"columns of one name: \['l_elbow.1'\]",
+     lambda _: demonstrations_from_frame(table_of(**{"l_elbow.1": stamps() ** 2}))),
+    ("a_table_with_another_calendar", r"'time' holds neither numbers nor dates.*'31\.1\.26'",
+     lambda _: demonstrations_from_frame(table_of(time="31.1.26"))),
+    ("a_table_with_decimal_commas", r"'elbow' holds no numbers.*'0,5'.*decimal=','",
+     lambda _: demonstrations_from_frame(table_of(elbow="0,5"))),
+    ("a_model_that_is_not_there", r"is missing|not a saved",
+     lambda folder: load_model(folder / "model")),
+    ("a_robot_that_is_not_there", r"robot\.urdf",
+     lambda folder: Robot.from_urdf(folder / "robot.urdf", ["hand"])),
+])  # fmt: skip
 
 
 @mistake("files", r"more fields than its header")
@@ -1022,11 +859,6 @@ def a_set_without_a_state(folder):
     load_lerobot(root)
 
 
-@mistake("files", r"is missing|not a saved")
-def a_model_that_is_not_there(folder):
-    load_model(folder / "model")
-
-
 @mistake("files", r"changed after it was saved")
 def a_model_that_was_edited(folder):
     save(learned(), folder / "model")
@@ -1035,11 +867,6 @@ def a_model_that_was_edited(folder):
     config["model"]["reg_covar"] = 3.0
     path.write_text(json.dumps(config))
     load_model(folder / "model")
-
-
-@mistake("files", r"robot\.urdf")
-def a_robot_that_is_not_there(folder):
-    Robot.from_urdf(folder / "robot.urdf", ["hand"])
 
 
 @cache
@@ -1073,11 +900,6 @@ def load_arms(folder, change=lambda item: item, **options):
     return load_lerobot(root, robot=parse_robot(robot), **options)
 
 
-@mistake("units", r"not radians.*'lerobot'")
-def arms_in_lerobots_units_that_nobody_said(folder):
-    load_arms(folder)
-
-
 @mistake("units", r"'left_gripper.pos' goes from .* normalised to 0 \.\.\. 100.*degrees")
 def grippers_beyond_their_hundred(folder):
     load_arms(folder, joints(1.6, 5), units="lerobot")
@@ -1088,14 +910,16 @@ def raw_grippers_of_a_robot_with_limits(folder):
     load_arms(folder, units={"*": "deg", "*gripper": "raw"})
 
 
-@mistake("units", r"units names \['\*griper'\], which fit no value")
-def a_pattern_that_is_misspelt(folder):
-    load_arms(folder, units={"*": "deg", "*griper": "raw"})
-
-
-@mistake("robots", r"20 m apart: are poses in metres, or in centimetres")
-def bases_in_centimetres(_):
-    parse_robot("left=so101@0,20,0;right=so101@0,0,0")
+enter("robots", [
+    ("bases_in_centimetres", r"20 m apart: are poses in metres, or in centimetres",
+     lambda _: parse_robot("left=so101@0,20,0;right=so101@0,0,0")),
+    ("an_arm_that_is_nowhere", r"robot 'right=so101' is not NAME=FILE@X,Y,Z",
+     lambda _: parse_robot(["left=so101@0,0.2,0", "right=so101"])),
+    ("two_arms_of_one_name", r"robot 'a=so101@0,1,0' is there twice",
+     lambda _: parse_robot(["a=so101@0,0,0", "a=so101@0,1,0"])),
+    ("a_base_that_is_turned_by_degrees", r"robot 'a=so101@0,0,0,90' is not .*YAW \(radians\)",
+     lambda _: parse_robot("a=so101@0,0,0,90")),
+])  # fmt: skip
 
 
 def cups_at(place):
@@ -1117,18 +941,3 @@ def an_object_that_no_hand_comes_near(folder):
 def a_base_of_two_numbers(_):
     arm = parse_robot("so101")
     Robot.combine({"left": [0.0, 0.2]}, left=arm, right=arm)
-
-
-@mistake("robots", r"robot 'right=so101' is not NAME=FILE@X,Y,Z")
-def an_arm_that_is_nowhere(_):
-    parse_robot(["left=so101@0,0.2,0", "right=so101"])
-
-
-@mistake("robots", r"robot 'a=so101@0,1,0' is there twice")
-def two_arms_of_one_name(_):
-    parse_robot(["a=so101@0,0,0", "a=so101@0,1,0"])
-
-
-@mistake("robots", r"robot 'a=so101@0,0,0,90' is not .*YAW \(radians\)")
-def a_base_that_is_turned_by_degrees(_):
-    parse_robot("a=so101@0,0,0,90")

@@ -1,6 +1,6 @@
 """Random regression problems, in our terms and in the oracles'."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,8 +27,6 @@ from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, Inform
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import RobotState
 
-Rows = Callable[[oracles.At], list[oracles.Row]]
-
 
 def random_local(rng: np.random.Generator, n_components: int, centre: Array) -> oracles.Local:
     """Gaussians over time in [0, 2] s and coordinates around ``centre``, with correlations."""
@@ -47,13 +45,34 @@ def conditionals_of(local: oracles.Local) -> Conditionals:
     return Conditionals.of(torch.from_numpy(local.means), torch.from_numpy(local.covariances))
 
 
+#: The rows of Table I of those that name a link, and perhaps what it is seen from.
+ROWS = {
+    AbsolutePosition: oracles.absolute_position,
+    AbsoluteOrientation: oracles.absolute_orientation,
+    RelativePosition: oracles.relative_position,
+    RelativeOrientation: oracles.relative_orientation,
+}
+
+
+def row_of(at: oracles.At, operator: Operator) -> oracles.Row:
+    """Give an operator's row of Table I, as the oracles write it."""
+    if isinstance(operator, Stack):
+        return oracles.stack(*(row_of(at, one) for one in operator.operators))
+    if isinstance(operator, Canonical):
+        return oracles.canonical(at)
+    frame = [operator.frame] if hasattr(operator, "frame") else []
+    return ROWS[type(operator)](at, operator.link, *frame)
+
+
 @dataclass(frozen=True)
 class Case:
     """Operators in a world, with their rows of Table I."""
 
     world: World
     operators: Sequence[Operator]
-    rows: Rows
+
+    def rows(self, at: oracles.At) -> list[oracles.Row]:
+        return [row_of(at, operator) for operator in self.operators]
 
 
 @dataclass(frozen=True)
@@ -87,6 +106,14 @@ class Problem:
         log_weights = torch.from_numpy(self.weights).log()
         kinematics = self.case.world.kinematics
         return Regression(kinematics, self.case.operators, conditionals, log_weights, **options)
+
+    def estimate(
+        self, time: Tensor | None = None, *, candidates: bool = False, **options: Any
+    ) -> Estimate:
+        """Estimate at a time, or at that of ``times()``, by a regression with the options."""
+        now = times() if time is None else time
+        at = self.state, self.frames
+        return self.regression(**options).estimate(now, *at, candidates=candidates)
 
     def rows(self, index: tuple[int, ...] = ()) -> list[oracles.Row]:
         return self.case.rows(self.at(index))
@@ -136,75 +163,22 @@ def pose_of(link: str, frame: str) -> Stack:
     return Stack(RelativePosition(link, frame), RelativeOrientation(link, frame))
 
 
-def pose_rows(at: oracles.At, link: str, frame: str) -> list[oracles.Row]:
-    return [
-        oracles.relative_position(at, link, frame),
-        oracles.relative_orientation(at, link, frame),
-    ]
-
-
 BOTH_HANDS = Stack(pose_of(LEFT, OBJECT), pose_of(RIGHT, OBJECT))
 
 
-def both_hands(at: oracles.At) -> oracles.Row:
-    return oracles.stack(*pose_rows(at, LEFT, OBJECT), *pose_rows(at, RIGHT, OBJECT))
-
-
+ABSOLUTE = [
+    kind(link) for link in (LEFT, RIGHT) for kind in (AbsolutePosition, AbsoluteOrientation)
+]
+POSITIONS = Stack(RelativePosition(LEFT, OBJECT), AbsolutePosition(RIGHT))
+THREE = [RelativePosition(LEFT, OBJECT), pose_of(LEFT, RIGHT), Canonical()]
 CASES = {
-    "canonical": Case(OnRobot(), [Canonical()], lambda at: [oracles.canonical(at)]),
-    "both hands": Case(OnRobot(), [BOTH_HANDS], lambda at: [both_hands(at)]),
-    "the paper's": Case(
-        OnRobot(), [BOTH_HANDS, Canonical()], lambda at: [both_hands(at), oracles.canonical(at)]
-    ),
-    "positions": Case(
-        OnRobot(),
-        [Stack(RelativePosition(LEFT, OBJECT), AbsolutePosition(RIGHT)), Canonical()],
-        lambda at: [
-            oracles.stack(
-                oracles.relative_position(at, LEFT, OBJECT),
-                oracles.absolute_position(at, RIGHT),
-            ),
-            oracles.canonical(at),
-        ],
-    ),
-    "three": Case(
-        OnRobot(),
-        [RelativePosition(LEFT, OBJECT), pose_of(LEFT, RIGHT), Canonical()],
-        lambda at: [
-            oracles.relative_position(at, LEFT, OBJECT),
-            oracles.stack(*pose_rows(at, LEFT, RIGHT)),
-            oracles.canonical(at),
-        ],
-    ),
+    "canonical": Case(OnRobot(), [Canonical()]),
+    "both hands": Case(OnRobot(), [BOTH_HANDS]),
+    "the paper's": Case(OnRobot(), [BOTH_HANDS, Canonical()]),
+    "positions": Case(OnRobot(), [POSITIONS, Canonical()]),
+    "three": Case(OnRobot(), THREE),
     "two that leave joints free": Case(
-        OnRobot(),
-        [AbsolutePosition(LEFT), AbsoluteOrientation(RIGHT)],
-        lambda at: [
-            oracles.absolute_position(at, LEFT),
-            oracles.absolute_orientation(at, RIGHT),
-        ],
+        OnRobot(), [AbsolutePosition(LEFT), AbsoluteOrientation(RIGHT)]
     ),
-    "poses in two frames": Case(
-        OnPoses(),
-        [
-            BOTH_HANDS,
-            Stack(
-                AbsolutePosition(LEFT),
-                AbsoluteOrientation(LEFT),
-                AbsolutePosition(RIGHT),
-                AbsoluteOrientation(RIGHT),
-            ),
-            Canonical(),
-        ],
-        lambda at: [
-            both_hands(at),
-            oracles.stack(
-                oracles.absolute_position(at, LEFT),
-                oracles.absolute_orientation(at, LEFT),
-                oracles.absolute_position(at, RIGHT),
-                oracles.absolute_orientation(at, RIGHT),
-            ),
-            oracles.canonical(at),
-        ],
-    ),
+    "poses in two frames": Case(OnPoses(), [BOTH_HANDS, Stack(*ABSOLUTE), Canonical()]),
 }

@@ -1,13 +1,12 @@
 """The laws of every operator.
 
-A test class names an operator, writes its row of Table I in terms of the oracles, and inherits
-the laws: from a world where it acts, from ``OperatorLaws`` what every operator obeys, from
-``RelativeLaws`` and ``OrientationLaws`` what those do.
+A test class names an operator, and its row in terms of the oracles if Table I has another. It
+inherits the laws: from a world where it acts, from ``OperatorLaws`` what every operator obeys,
+from ``RelativeLaws`` and ``OrientationLaws`` what those do.
 """
 
 import copy
 import pickle
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, replace
 
@@ -20,6 +19,7 @@ from torch import Tensor
 import tpgmm_torch
 from tests.support import oracles
 from tests.support.local_coordinates import local_coordinates
+from tests.support.mixtures import row_of
 from tests.support.worlds import (
     CARRIED,
     LEFT,
@@ -43,13 +43,13 @@ BATCHES = pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=["one", "batc
 class OperatorLaws(World):
     """What holds for every operator.
 
-    ``operator`` is the one under test and ``row`` its row of Table I.
+    ``operator`` is the one under test and ``row`` its row of Table I, unless it is another.
     """
 
     operator: Operator
 
-    @abstractmethod
-    def row(self, at: oracles.At) -> oracles.Row: ...
+    def row(self, at: oracles.At) -> oracles.Row:
+        return row_of(at, self.operator)
 
     def candidate(
         self, local: Tensor, state: RobotState, frames: Mapping[str, Frame]
@@ -298,10 +298,10 @@ PLACES = {
 }
 
 
-def laws_in_places(kinds, rows, laws, places=PLACES, **options) -> dict[str, type]:
+def laws_in_places(kinds, laws, places=PLACES, rows=None, **options) -> dict[str, type]:
     """Test classes of an absolute and a relative operator, by name, for each place and world.
 
-    ``kinds`` and ``rows`` are a pair each, of operators and of their rows of Table I.
+    ``kinds`` is a pair of operators, ``rows`` of their rows where Table I has others.
     """
     made = {}
     for place, (worlds, *names) in places.items():
@@ -309,10 +309,9 @@ def laws_in_places(kinds, rows, laws, places=PLACES, **options) -> dict[str, typ
         held = {"held": True} if relative and names[1] == CARRIED else {}
         for world in worlds:
             bases = (world, RelativeLaws, laws) if relative else (world, laws)
-            body = {
-                "operator": kinds[relative](*names, **options, **held),
-                "row": lambda _, at, row=rows[relative], names=names: row(at, *names),
-            }
+            body = {"operator": kinds[relative](*names, **options, **held)}
+            if rows:
+                body["row"] = lambda _, at, row=rows[relative], names=names: row(at, *names)
             name = f"Test{place}{world.__name__}"
             made[name] = type(world)(name, bases, body)
     return made

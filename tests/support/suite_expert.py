@@ -47,3 +47,8 @@ def replay(env: SuiteEnv, motion, references=None, seed=0, seconds=None, **start
 def tick(motion, event):
     """The time step at which a phase ends."""
     return int(np.searchsorted(motion.time.numpy(), motion.events[event]))
+
+
+def missed(task, figures):
+    """The criteria of a task that are not met."""
+    return {key for key, f in task.figures.items() if not f.low <= figures[key] <= f.high}

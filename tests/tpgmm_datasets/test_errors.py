@@ -20,8 +20,8 @@ def test_errors_survive_pickling(root):
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_what_relax_helps_is_said_with_what_it_costs(check):
-    told = str(DatasetError("it is wrong", check=check, file=DATA, episode=3))
-    assert f"relax=['{check}'] (--relax {check}) the episode is left out" in told
-    assert told == str(DatasetError(told, check=check))
-    told = str(DatasetError("it is wrong", check=check, file="meta/info.json"))
-    assert ("relax=" in told) == (check != "missing")
+    message = str(DatasetError("it is wrong", check=check, file=DATA, episode=3))
+    assert f"relax=['{check}'] (--relax {check}) the episode is left out" in message
+    assert message == str(DatasetError(message, check=check))
+    message = str(DatasetError("it is wrong", check=check, file="meta/info.json"))
+    assert ("relax=" in message) == (check != "missing")

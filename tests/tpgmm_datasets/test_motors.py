@@ -77,17 +77,14 @@ def test_scales_with_a_zero_of_their_own_and_known_motors_are_kept() -> None:
 
 def test_positions_alone_tell_all_but_the_roll() -> None:
     degrees, poses, signs, offsets = record(1)
-    told = {"names": MOTORS, "units": "deg", "orientations": False, "position_std": 0.002}
-    with pytest.raises(
-        DatasetError, match=r"motor 'wrist_roll.pos' .*known=\['wrist_roll.pos'\]"
-    ):
-        estimate_motor_map(ARM, LINK, degrees[:6], poses[:6], **told)
+    given = {"names": MOTORS, "units": "deg", "orientations": False, "position_std": 0.002}
+    message = r"motor 'wrist_roll.pos' .*known=\['wrist_roll.pos'\]"
+    with pytest.raises(DatasetError, match=message):
+        estimate_motor_map(ARM, LINK, degrees[:6], poses[:6], **given)
     roll = Scale(signs[4].item() * math.pi / 180, offsets[4].item())
     units = {**dict.fromkeys(MOTORS, "deg"), "wrist_roll.pos": roll}
-    known = ["wrist_roll.pos"]
-    found = estimate_motor_map(
-        ARM, LINK, degrees, poses, **told | {"units": units, "known": known}
-    )
+    given |= {"units": units, "known": ["wrist_roll.pos"]}
+    found = estimate_motor_map(ARM, LINK, degrees, poses, **given)
     assert errors(found, offsets, MOTORS[:4]).abs().max() < 1.5
     assert math.isnan(found.orientation_error)
     assert "shoulder_pan.pos" in str(found)
@@ -100,9 +97,8 @@ def test_a_motor_that_stood_still_is_pointed_out() -> None:
     joints[:, 2] = 0.3
     state = ARM.state(joints)
     still = Frame(state.position(LINK), state.orientation(LINK))
-    with pytest.raises(
-        DatasetError, match=r"sign and the offset of motor 'elbow_flex'.*more post"
-    ):
+    message = r"sign and the offset of motor 'elbow_flex'.*more post"
+    with pytest.raises(DatasetError, match=message):
         estimate_motor_map(ARM, LINK, torch.rad2deg(joints), still, units="deg")
 
 
@@ -115,11 +111,12 @@ def test_poses_that_are_not_the_robots_are_refused() -> None:
 
 def test_what_does_not_fit_together_is_refused() -> None:
     degrees, poses, _, _ = record(5)
-    with pytest.raises(DatasetError, match=r"shape \(n, 6\).*got values \(10, 5\)"):
-        estimate_motor_map(ARM, LINK, degrees[:, :5], poses)
-    with pytest.raises(DatasetError, match=r"poses \(9,\)"):
-        estimate_motor_map(ARM, LINK, degrees, poses[:9])
-    with pytest.raises(DatasetError, match=r"known motors \['thumb'\] are not among"):
-        estimate_motor_map(ARM, LINK, degrees, poses, units="deg", known=["thumb"])
-    with pytest.raises(DatasetError, match="0 motors move the link"):
-        estimate_motor_map(ARM, LINK, degrees, poses, units="deg", known=ARM.joint_names)
+    given: tuple[Any, ...] = (
+        ((degrees[:, :5], poses), {}, r"shape \(n, 6\).*got values \(10, 5\)"),
+        ((degrees, poses[:9]), {}, r"poses \(9,\)"),
+        ((degrees, poses), {"known": ["thumb"]}, r"known motors \['thumb'\] are not among"),
+        ((degrees, poses), {"known": ARM.joint_names}, "0 motors move the link"),
+    )
+    for values, options, message in given:
+        with pytest.raises(DatasetError, match=message):
+            estimate_motor_map(ARM, LINK, *values, units="deg", **options)

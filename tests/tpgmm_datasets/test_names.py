@@ -32,7 +32,7 @@ def test_names_are_found_however_they_are_nested(root, tmp_path, names):
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "message"),
     [
         (["a", "b"], "2 names for 3 values"),
         (["a", "b", "c", "d"], "4 names for 3 values"),
@@ -47,15 +47,15 @@ def test_names_are_found_however_they_are_nested(root, tmp_path, names):
         ("abc", "1 names for 3 values"),
     ],
 )
-def test_names_that_cannot_be_used_are_an_error_that_says_why(root, tmp_path, names, told):
+def test_names_that_cannot_be_used_are_an_error_that_says_why(root, tmp_path, names, message):
     plain = to_v21(root, tmp_path / "plain")
     change_info(plain, lambda i: i["features"]["observation.state"].update(names=names))
     remedy = r"joint_names=.*--joint-name NAME.*joint_names='robot'"
     for options in {}, {"robot": Arm("a", "b", "c")}, {"joint_names": {"a": "b"}}:
-        with pytest.raises(DatasetError, match=f"({told}).*{remedy}"):
+        with pytest.raises(DatasetError, match=f"({message}).*{remedy}"):
             load_lerobot(plain, **options)
     [problem] = describe_lerobot(plain).problems
-    assert re.search(told, str(problem)) and problem.check == "joints"
+    assert re.search(message, str(problem)) and problem.check == "joints"
     for order in ["x", "y", "z"], "robot":
         found = load_lerobot(plain, robot=Arm("x", "y", "z"), joint_names=order)
         assert found[0].joint_names == ("x", "y", "z")

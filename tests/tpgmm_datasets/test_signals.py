@@ -31,11 +31,14 @@ class Arm:
 
 
 def test_signals_of_a_data_set(recording):
-    told = Signals.of(recording, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
-    assert told.fps == 5 and told.state_names == told.action_names == ("a.pos", "b.pos")
-    assert told.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
-    assert told.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
-    assert told.environment_names[7] == "cup.x"
+    found = Signals.of(recording, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
+    assert found.fps == 5 and found.state_names == found.action_names == (
+        "a.pos",
+        "b.pos",
+    )
+    assert found.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
+    assert found.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
+    assert found.environment_names[7] == "cup.x"
 
 
 def test_offsets_that_a_cell_adds_are_no_part_of_the_units(recording, tmp_path):
@@ -58,9 +61,9 @@ def test_entries_are_called_as_the_joints_are(recording):
         joint_names = ("wrist", "elbow")
 
     names = {"a.pos": "elbow", "b.pos": "wrist"}
-    told = Signals.of(recording, Other(), units="deg", joint_names=names)
-    assert told.state_names == told.action_names == ("elbow", "wrist")
-    assert set(told.units) == {"elbow", "wrist"}
+    found = Signals.of(recording, Other(), units="deg", joint_names=names)
+    assert found.state_names == found.action_names == ("elbow", "wrist")
+    assert set(found.units) == {"elbow", "wrist"}
 
 
 @pytest.mark.parametrize("order", ["robot", ["b", "a"]])
@@ -72,8 +75,8 @@ def test_names_of_all_joints_are_those_of_actions_too(tmp_path, state, order):
         change_info(root, lambda i, key=key: i["features"][key].update(names=state))
     for file in root.glob("data/*/*"):
         pq.write_table(pq.read_table(file).replace_schema_metadata(None), file)
-    told = Signals.of(root, Arm(), joint_names=order)
-    assert told.state_names == told.action_names == ("b", "a")
+    found = Signals.of(root, Arm(), joint_names=order)
+    assert found.state_names == found.action_names == ("b", "a")
     change_info(root, lambda i: i["features"]["observation.state"].update(names=["a", "b"]))
     if state == ["a", "a"]:
         with pytest.raises(DatasetError, match=r"'action'.*'a' is there twice"):
@@ -87,20 +90,18 @@ def test_frames_that_no_policy_could_observe_are_left_out(recording):
         "hand": LinkPose("hand", "grasp"),
         "table": Frame([0.0, 0.0, 0.0]),
     }
-    told = Signals.of(recording, units="raw", frames=frames)
-    assert told.frames == {"here": tuple(range(3, 10))}
-    assert told.units == {} and told.fps == 10
+    found = Signals.of(recording, units="raw", frames=frames)
+    assert found.frames == {"here": tuple(range(3, 10))}
+    assert found.units == {} and found.fps == 10
 
 
 def test_actions_in_another_unit_than_states_are_refused(tmp_path):
     demonstration = Demonstration(np.arange(5) / 10, np.zeros((5, 2)), joint_names=("a", "b"))
-    save_lerobot([demonstration], tmp_path / "set", fps=10, task="stir")
-    assert Signals.of(tmp_path / "set").units == {}
-    change_info(
-        tmp_path / "set",
-        lambda info: info["features"]["action"].update(info={"units": ["rad", "deg"]}),
-    )
+    root = save_lerobot([demonstration], tmp_path / "set", fps=10, task="stir")
+    assert Signals.of(root).units == {}
+    units = {"units": ["rad", "deg"]}
+    change_info(root, lambda info: info["features"]["action"].update(info=units))
     with pytest.raises(DatasetError, match="column 'action': 'b' is in 'deg', but 'b'"):
-        Signals.of(tmp_path / "set")
+        Signals.of(root)
     with pytest.raises(DatasetError, match=r"column 'observation.state': 'b' is in 'rad'"):
-        Signals.of(tmp_path / "set", joints="action")
+        Signals.of(root, joints="action")

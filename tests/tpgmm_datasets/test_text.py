@@ -58,7 +58,7 @@ FRAME, ONCE = "is not NAME, NAME=FEATURE", "units are one for all"
 
 
 @pytest.mark.parametrize(
-    ("parse", "texts", "told"),
+    ("parse", "texts", "message"),
     [
         *((parse_frames, [text], FRAME) for text in ("a=", "=b", "a=b[1]", "a=b@", "a@b")),
         (parse_frames, ["a=b", "a=c"], FRAME),
@@ -77,6 +77,6 @@ FRAME, ONCE = "is not NAME, NAME=FEATURE", "units are one for all"
         *((parse_units, texts, ONCE) for texts in (["a="], ["=deg"], ["=a=deg"])),
     ],
 )
-def test_other_texts_are_refused(parse, texts, told):
-    with pytest.raises(DataError, match=told):
+def test_other_texts_are_refused(parse, texts, message):
+    with pytest.raises(DataError, match=message):
         parse(texts)

@@ -4,37 +4,29 @@ import math
 
 import pytest
 
-from tests.support.lerobot_sets import (
-    DATA,
-    NAMES,
-    Arm,
-    assert_equal,
-    change_info,
-    change_table,
-    joints_of,
-    set_column,
-    undeclared,
-)
+from tests.support import lerobot_sets
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
 from tpgmm_datasets.robots import parse_robot
 from tpgmm_datasets.units import as_scale, guess_unit, units_of, with_pose_units
 
 
 def test_declared_units_are_believed(root):
-    expected = joints_of(load_lerobot(root))
-    undeclared(root, 180 / math.pi)
+    expected = lerobot_sets.joints_of(load_lerobot(root))
+    lerobot_sets.undeclared(root, 180 / math.pi)
     units = {"units": ["deg", "deg", "deg"]}
-    change_info(root, lambda i: i["features"]["observation.state"].update(info=units))
-    assert_equal(joints_of(load_lerobot(root)), expected)
+    lerobot_sets.change_info(
+        root, lambda i: i["features"]["observation.state"].update(info=units)
+    )
+    lerobot_sets.assert_equal(lerobot_sets.joints_of(load_lerobot(root)), expected)
 
 
 def test_values_that_cannot_be_radians_are_refused_until_said_what_they_are(root):
-    undeclared(root, 1000)
+    lerobot_sets.undeclared(root, 1000)
     with pytest.raises(DatasetError, match=r"not radians: 'left_elbow' .*'deg'") as caught:
         load_lerobot(root)
     assert caught.value.column == "observation.state"
-    assert caught.value.file == DATA
-    raw = joints_of(load_lerobot(root, units="raw"))
+    assert caught.value.file == lerobot_sets.DATA
+    raw = lerobot_sets.joints_of(load_lerobot(root, units="raw"))
     assert max(float(joints.abs().max()) for joints in raw) > 4 * math.pi
 
 
@@ -42,15 +34,19 @@ def test_values_that_are_no_joints_of_the_robot_need_no_unit(root):
     def percent(values):
         return values * [1, 1, 1000]
 
-    change_table(root, DATA, lambda t: set_column(t, "observation.state", percent))
-    change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
+    lerobot_sets.change_table(
+        root,
+        lerobot_sets.DATA,
+        lambda t: lerobot_sets.set_column(t, "observation.state", percent),
+    )
+    lerobot_sets.change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
     seen = []
     load_lerobot(
         root,
-        robot=Arm("left_elbow", "right_elbow"),
+        robot=lerobot_sets.Arm("left_elbow", "right_elbow"),
         events={"largest": lambda d: seen.append(d) or float(d.time[d.joints[:, 2].argmax()])},
     )
-    assert seen[0].joint_names == NAMES
+    assert seen[0].joint_names == lerobot_sets.NAMES
 
 
 def test_scales_take_the_ends_of_a_range_to_each_other():
@@ -107,8 +103,8 @@ def test_names_come_before_patterns_and_these_before_the_default(order):
     given = dict([*units, ("*gripper", "rad"), ("left_*", "raw")])
     stored = ("left_gripper.pos", "left_elbow.pos", "right_gripper", "wrist", "up")
     final = ("left_gripper", "left_elbow", "right_gripper", "wrist", "lift")
-    told = units_of(given, stored, final, None, "")
-    assert told == ["mm", "raw", "rad", "deg", "m"]
+    found = units_of(given, stored, final, None, "")
+    assert found == ["mm", "raw", "rad", "deg", "m"]
     assert units_of({"*elbow": "deg"}, stored, final, None, "")[1:3] == ["deg", "auto"]
 
 
@@ -125,5 +121,5 @@ def test_lerobots_units_are_degrees_and_a_grippers_range():
             assert unit == "deg"
     free = robot.drop_limits(["left_gripper", "right_gripper"])
     for other in (None, free, parse_robot("so101")):  # no limits of that joint are known
-        told = units_of("lerobot", stored, robot.joint_names, other, "")
-        assert told == ["raw" if "gripper" in name else "deg" for name in stored]
+        found = units_of("lerobot", stored, robot.joint_names, other, "")
+        assert found == ["raw" if "gripper" in name else "deg" for name in stored]

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from tests.support.lerobot_sets import to_v21
 from tests.support.written_sets import FPS, assert_same, demonstration, unit
 from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
-from tpgmm_datasets import writer as writer_module
 from tpgmm_datasets.writer import add_frames
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -43,15 +42,11 @@ def test_identity_over_lengths_names_and_rates(
     tmp_path_factory, lengths, names, frames, fps, start
 ):
     rng = np.random.default_rng(sum(lengths))
-    written = [
-        Demonstration(
-            start + np.arange(length) / fps,
-            rng.normal(size=(length, 3)),
-            {name: Frame(rng.normal(size=3), unit(rng)) for name in frames},
-            names,
-        )
-        for length in lengths
-    ]
+    written = []
+    for length in lengths:
+        time, joints = start + np.arange(length) / fps, rng.normal(size=(length, 3))
+        poses = {name: Frame(rng.normal(size=3), unit(rng)) for name in frames}
+        written.append(Demonstration(time, joints, poses, names))
     root = tmp_path_factory.mktemp("sets") / "set"
     save_lerobot(written, root, fps=fps, task="x", dtype="float64")
     for found, expected in zip(load_lerobot(root), written, strict=True):
@@ -61,10 +56,9 @@ def test_identity_over_lengths_names_and_rates(
 def test_actions_are_the_references_that_were_given(tmp_path):
     first = demonstration(0)
     second = demonstration(1).reorder(["joint_2", "joint_0", "joint_1"])
-    references = [motion.joints + 0.5 for motion in (first, second)]
-    root = save_lerobot(
-        [first, second], tmp_path / "set", fps=FPS, task="reach", actions=references
-    )
+    options = {"fps": FPS, "task": "reach"}
+    options["actions"] = [motion.joints + 0.5 for motion in (first, second)]
+    root = save_lerobot([first, second], tmp_path / "set", **options)
     for key, shift in (("observation.state", 0.0), ("action", 0.5)):
         found = load_lerobot(root, joints=key)
         for read, written in zip(found, (first, second), strict=True):
@@ -74,19 +68,16 @@ def test_actions_are_the_references_that_were_given(tmp_path):
 
 def test_actions_that_do_not_fit_are_refused(tmp_path):
     motion = demonstration()
-    for actions, message in (
-        ([], "actions of 0 and joints of 1"),
-        ([motion.joints[:, :2]], "joint_names needs 2"),
-        ([motion.joints[:5]], "T = 20"),
-        ([motion.joints * np.nan], "NaN"),
+    unnamed, few = Demonstration(motion.time, motion.joints), motion.joints[:, :2]
+    for shown, actions, error, message in (
+        (motion, [], ValueError, "actions of 0 and joints of 1"),
+        (motion, [few], ValueError, "joint_names needs 2"),
+        (motion, [motion.joints[:5]], ValueError, "T = 20"),
+        (motion, [motion.joints * np.nan], ValueError, "NaN"),
+        (unnamed, [few], DatasetError, "3 joints and actions of 2"),
     ):
-        with pytest.raises(ValueError, match=message):
-            save_lerobot([motion], tmp_path / "set", fps=FPS, task="reach", actions=actions)
-    unnamed = Demonstration(motion.time, motion.joints)
-    with pytest.raises(DatasetError, match="3 joints and actions of 2"):
-        save_lerobot(
-            [unnamed], tmp_path / "set", fps=FPS, task="reach", actions=[motion.joints[:, :2]]
-        )
+        with pytest.raises(error, match=message):
+            save_lerobot([shown], tmp_path / "set", fps=FPS, task="reach", actions=actions)
     assert not (tmp_path / "set").exists()
 
 
@@ -98,6 +89,7 @@ def test_append_adds_episodes_tasks_and_statistics(tmp_path):
     save_lerobot(written[2:], root, fps=FPS, task=["b", "b", "a"], append=True)
     for found, expected in zip(load_lerobot(root), written, strict=True):
         assert_same(found, expected, 1e-6)
+    assert len(list(root.glob("data/*/*.parquet"))) == 2  # each call's in a file of its own
     assert len(load_lerobot(root, episodes="b")) == 2
     assert read_info(root) == read_info(once)
     both = [json.loads((r / "meta" / "stats.json").read_text()) for r in (root, once)]
@@ -142,7 +134,10 @@ def test_append_refuses_what_does_not_fit(tmp_path, other, arguments, message):
     assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
 
 
-@pytest.mark.parametrize("stage", ["episode_statistics", "write_tables", "feature_table"])
+STAGES = ("summed.episode_statistics", "write_tables", "kept.feature_table")
+
+
+@pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("append", [False, True])
 def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, stage, append):
     root = tmp_path / "set"
@@ -150,7 +145,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
     if append:
         save_lerobot(old, root, fps=FPS, task="reach")
 
-    monkeypatch.setattr(writer_module, stage, interrupt)
+    monkeypatch.setattr(f"tpgmm_datasets.writer.{stage}", interrupt)
     with pytest.raises(KeyboardInterrupt):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
     assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])
@@ -160,18 +155,11 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
 
 @pytest.mark.slow
 def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
-    environment = {
-        **os.environ,
-        "HF_HUB_OFFLINE": "1",
-        "HF_HOME": str(tmp_path / "hub"),
-        "OMP_NUM_THREADS": "1",
-        "CUDA_VISIBLE_DEVICES": "",
-    }
+    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hub")}
+    alone = {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     script = Path(__file__).parents[1] / "support" / "opened_by_lerobot.py"
-    command = [sys.executable, str(script), str(tmp_path)]
-    result = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=False
-    )
+    command, environment = [sys.executable, str(script), tmp_path], os.environ | offline | alone
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr[-3000:]
     assert "all equal" in result.stdout
 
@@ -190,10 +178,8 @@ def test_a_set_with_frames_added_is_the_one_that_had_them(tmp_path, kept):
     whole = [demonstration(seed, length=10 + seed) for seed in range(5)]
     few = [replace(one, frames={name: one.frames[name] for name in kept}) for one in whole]
     added = {n: [one.frames[n] for one in whole] for n in ("bottle", "hand") if n not in kept}
-    had, root = (
-        save_in_two_files(whole, tmp_path / "had"),
-        save_in_two_files(few, tmp_path / "set"),
-    )
+    had = save_in_two_files(whole, tmp_path / "had")
+    root = save_in_two_files(few, tmp_path / "set")
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     if not added:
         with pytest.raises(DatasetError, match=r"frames \['hand'\] some are in the set"):
@@ -218,20 +204,20 @@ def test_a_set_with_frames_added_is_the_one_that_had_them(tmp_path, kept):
 
 def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
     given = {"cup": [Frame([0.3, 0, 0])] * 3}
-    for frames, told in (
+    for frames, message in (
         ({"cup": "hand@close"}, r"table .* or frames by episode .*'hand@close'.*LINK@EVENT"),
         ({"bottle": given["cup"]}, r"frames \['bottle'\] some are in the set"),
         ({}, "by episode can be added, got {}"),
         ({"cup": given["cup"][:2]}, "list of 2 Frame"),
         ({"cup": [Frame(np.zeros((12, 3)))] * 3}, "episode 1: frame 'cup' has 12 poses"),
     ):
-        with pytest.raises(DatasetError, match=told):
+        with pytest.raises(DatasetError, match=message):
             add_frames(root, tmp_path / "copy", frames)
     with pytest.raises(DatasetError, match=r"sets of v3\.0, this is v2\.1 .*dataset convert"):
         add_frames(to_v21(root, tmp_path / "old"), tmp_path / "copy", given)
-    for stage in ("episode_statistics", "write_tables"):
+    for stage in STAGES[:2]:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(writer_module, stage, interrupt)
+            patch.setattr(f"tpgmm_datasets.writer.{stage}", interrupt)
             add_frames(root, tmp_path / "copy", given)
     with pytest.raises(TypeError):  # the last that is written
         add_frames(root, tmp_path / "copy", given, files={"meta/cell.json": None})

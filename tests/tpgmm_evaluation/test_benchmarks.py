@@ -69,9 +69,8 @@ def test_episodes_hold_what_was_seen_of_the_objects(recording, motions):
 
 
 def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
-    assert (folder / "episodes" / "s0" / "summary.json").read_text().count(
-        "true"
-    ) == DEMONSTRATIONS
+    summary = (folder / "episodes" / "s0" / "summary.json").read_text()
+    assert summary.count("true") == DEMONSTRATIONS
     assert np.ptp([slid(motion)[0] for motion in motions[:DEMONSTRATIONS]]) > 0.01
 
 
@@ -113,12 +112,10 @@ def test_places_leave_the_error_of_the_grasp(folder, settings):
 
 def test_what_is_held_is_put_exactly_however_it_slid():
     benchmark = CarryBenchmark(rate=25)
-    demonstrations = DynamicTimeWarping(features=["directions"]).fit_transform(
-        benchmark.skill.demonstrations(10, seed=0)
-    )
-    model = TaskParameterizedGMM(
-        benchmark.n_components, benchmark.operators(orientation=True), benchmark.robot
-    ).fit(attach_holds(demonstrations, benchmark.robot))
+    shown, operators = benchmark.skill.demonstrations(10, seed=0), benchmark.operators(True)
+    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(shown)
+    model = TaskParameterizedGMM(benchmark.n_components, operators, benchmark.robot)
+    model.fit(attach_holds(aligned, benchmark.robot))
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("bottle", "l_hand")
     policy = TPGMMPolicy.from_estimator(model, environment_names=NAMES)
@@ -140,15 +137,10 @@ def test_what_is_held_is_put_exactly_however_it_slid():
 def test_objects_are_told_apart_by_their_names(folder, settings, monkeypatch):
     """Operators name objects in an order of their own."""
     usual = CarryBenchmark.operators
-    monkeypatch.setattr(
-        CarryBenchmark,
-        "operators",
-        lambda self, orientation, held=True: usual(self, orientation, held)[::-1],
-    )
+    turned = lambda *given, **more: usual(*given, **more)[::-1]  # noqa: E731
+    monkeypatch.setattr(CarryBenchmark, "operators", turned)
     cell = Cell("carry_and_put", "tpgmm", DEMONSTRATIONS, 0)
     trained = TRAININGS["tpgmm"](settings.episodes_in(folder, 0), settings, cell)
     assert trained.policy.frames.frame_names == ("tray", "bottle")
-    assert trained.policy.frames.in_environment == {
-        "bottle": [*range(7)],
-        "tray": [*range(7, 14)],
-    }
+    places = {"bottle": [*range(7)], "tray": [*range(7, 14)]}
+    assert trained.policy.frames.in_environment == places

@@ -45,21 +45,16 @@ def test_results_come_in_natural_order(tmp_path):
     results = Results(tmp_path)
     for count in (10, 5, 25):
         results.write(replace(CELL, demonstrations=count), {})
-    assert [result["cell"]["demonstrations"] for result in results.read_all(print)] == [
-        5,
-        10,
-        25,
-    ]
+    counts = [result["cell"]["demonstrations"] for result in results.read_all(print)]
+    assert counts == [5, 10, 25]
 
 
 def test_settings_of_a_policy_share_a_training_and_not_a_result(tmp_path):
-    plain = replace(CELL, policy="tpgmm")
-    open_loop = replace(CELL, policy="tpgmm-open-loop")
-    other = replace(
-        CELL, policy="tpgmm --policy.control.feedback=observation --policy.units=a/b"
-    )
-    assert plain.training == open_loop.training == other.training
-    assert len({plain.key, open_loop.key, other.key}) == 3
-    assert "/" not in other.key and " " not in other.key
-    Results(tmp_path).write(other, {})
-    assert Results(tmp_path).read(other)["cell"]["policy"] == other.policy
+    given = "tpgmm --policy.control.feedback=observation --policy.units=a/b"
+    policies = ("tpgmm", "tpgmm-open-loop", given)
+    cells = [replace(CELL, policy=policy) for policy in policies]
+    assert len({cell.training for cell in cells}) == 1
+    assert len({cell.key for cell in cells}) == 3
+    assert "/" not in cells[2].key and " " not in cells[2].key
+    Results(tmp_path).write(cells[2], {})
+    assert Results(tmp_path).read(cells[2])["cell"]["policy"] == given

@@ -11,50 +11,57 @@ from tpgmm_evaluation.compare import Comparison
 
 
 def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
-    text = output("compare", "--help-all")
+    text = " ".join(output("compare", "--help-all").split())
     for word in ("--budget", "--conditions", "everything", "lerobot-eval", "-phase"):
-        assert word in " ".join(text.split())
-    out = ("--out", tmp_path / "out")
-    assert "policy 'bc' is not in the comparison" in refusal(
-        "compare", "--policies", "bc", *out
-    )
-    assert "numbers like 5,10,25" in refusal("compare", "--demonstrations", "5;6", *out)
-    assert "disturbance 'rain'" in refusal("compare", "--conditions", "rain", *out)
-    assert "environment 'moon' is not in the comparison; it has ['aloha_ins" in refusal(
-        "compare", "--env", "carry_and_put,moon", *out
-    )
-    assert "holds no comparison" in refusal("compare", "--report-only", *out)
-    result = run("compare", "--demonstrations", "101", *out)
-    assert result.exit_code == 2
-    assert "offers 100 demonstrations" in result.stderr
+        assert word in text
+    for arguments, said in (
+        (["--policies", "bc"], "policy 'bc' is not in the comparison"),
+        (["--demonstrations", "5;6"], "numbers like 5,10,25"),
+        (["--conditions", "rain"], "disturbance 'rain'"),
+        (
+            ["--env", "carry_and_put,moon"],
+            "environment 'moon' is not in the comparison; it has ['aloha_ins",
+        ),
+        (["--report-only"], "holds no comparison"),
+    ):
+        assert said in refusal("compare", *arguments, "--out", tmp_path / "out")
+    result = run("compare", "--demonstrations", "101", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "offers 100 demonstrations" in result.stderr
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """The arguments of a comparison that is not made."""
+    given = []
+
+    def compare(*arguments):
+        given.extend(arguments)
+        return Comparison(0, {})
+
+    monkeypatch.setattr(module, "compare", compare)
+    return given
+
+
+BOTH = ["--policies", "tpgmm,act"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "policies", "conditions"),
     [
-        (["--policies", "tpgmm,act"], ["tpgmm", "act"], ["nominal"]),
+        (BOTH, ["tpgmm", "act"], ["nominal"]),
         (
-            ["--policies", "tpgmm,act", "--conditions", "nominal,stopped-3"],
+            [*BOTH, "--conditions", "nominal,stopped-3"],
             ["tpgmm", "tpgmm-open-loop", "act"],
             ["nominal", "stopped-3"],
         ),
-        (
-            ["--policies", "act", "--conditions", "all"],
-            ["act"],
-            ["all"],
-        ),
+        (["--policies", "act", "--conditions", "all"], ["act"], ["all"]),
     ],
 )
 def test_disturbed_policies_stand_beside_the_open_loop(
-    arguments, policies, conditions, tmp_path, monkeypatch
+    arguments, policies, conditions, tmp_path, called
 ):
-    called = []
-    monkeypatch.setattr(
-        module, "compare", lambda *given: called.extend(given) or Comparison(0, {})
-    )
     assert run("compare", *arguments, "--out", tmp_path).exit_code == 0
-    assert called[2] == policies
-    assert called[5] == conditions
+    assert called[2] == policies and called[5] == conditions
 
 
 @pytest.mark.parametrize(
@@ -68,11 +75,7 @@ def test_disturbed_policies_stand_beside_the_open_loop(
         ("aloha_state,all", ["aloha_state", *(n for n in BENCHMARKS if n != "aloha_state")]),
     ],
 )
-def test_environments_have_names_together(given, meant, tmp_path, monkeypatch):
-    called = []
-    monkeypatch.setattr(
-        module, "compare", lambda *given: called.extend(given) or Comparison(0, {})
-    )
+def test_environments_have_names_together(given, meant, tmp_path, called):
     arguments = ("--env", given, "--policies", "quick", "--demonstration-seed", 4)
     assert run("compare", *arguments, "--out", tmp_path).exit_code == 0
     assert [settings.env for settings in called[0]] == meant
@@ -82,11 +85,7 @@ def test_environments_have_names_together(given, meant, tmp_path, monkeypatch):
 
 
 def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        module,
-        "compare",
-        lambda *_: Comparison(1, {Cell("bottle_shaking", "tpgmm", 3, 0): "bad luck"}),
-    )
+    failed = Comparison(1, {Cell("bottle_shaking", "tpgmm", 3, 0): "bad luck"})
+    monkeypatch.setattr(module, "compare", lambda *_: failed)
     result = run("compare", "--out", tmp_path)
-    assert result.exit_code == 1
-    assert "1 cells failed" in result.stderr
+    assert result.exit_code == 1 and "1 cells failed" in result.stderr

@@ -24,13 +24,9 @@ from tpgmm_torch.exceptions import UnknownNameError
 
 pytestmark = pytest.mark.slow
 
+OPTIONS = {"mode": "kinematic"}
 SETTINGS = Settings(
-    options={"mode": "kinematic"},
-    rate=20,
-    episodes=2,
-    budget=0.0,
-    validation=2,
-    n_components=20,
+    options=OPTIONS, rate=20, episodes=2, budget=0.0, validation=2, n_components=20
 )
 NEAREST, TPGMM = (Cell("bottle_shaking", policy, 3, 0) for policy in ("nearest", "tpgmm"))
 
@@ -51,6 +47,12 @@ def whole(tmp_path_factory):
     return out
 
 
+@pytest.fixture
+def out(whole, tmp_path):
+    """A copy, which may be changed."""
+    return shutil.copytree(whole, tmp_path / "out")
+
+
 @pytest.fixture(scope="module")
 def folder(whole):
     """What it has of the environment."""
@@ -65,11 +67,8 @@ def test_both_policies_were_rolled_out_on_the_same_seeds(folder):
         assert [episode["seed"] for episode in result["episodes"]] == seeds
         assert result["latency"]["step_median_ms"] > 0
         assert result["training"]["fps"] == 20
-    grasps = {
-        cell: [episode["grasp_mm"] for episode in results.read(cell)["episodes"]]
-        for cell in (NEAREST, TPGMM)
-    }
-    assert max(grasps[TPGMM]) < min(grasps[NEAREST])
+    theirs, ours = (results.read(cell)["episodes"] for cell in (NEAREST, TPGMM))
+    assert max(one["grasp_mm"] for one in ours) < min(one["grasp_mm"] for one in theirs)
 
 
 def test_tables_and_report_say_what_the_cells_hold(whole):
@@ -92,9 +91,7 @@ def test_tables_and_report_say_what_the_cells_hold(whole):
             assert (whole / line.partition("(")[2].rstrip(")")).is_file()
 
 
-def test_the_report_can_be_written_again(whole, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+def test_the_report_can_be_written_again(out):
     before = (out / "report.md").read_text()
     (out / "report.md").unlink()
     (out / "results.parquet").unlink()
@@ -103,9 +100,7 @@ def test_the_report_can_be_written_again(whole, tmp_path):
     assert len(pd.read_parquet(out / "results.parquet")) == 4
 
 
-def test_seeds_learn_from_demonstrations_of_their_own(whole, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+def test_seeds_learn_from_demonstrations_of_their_own(out):
     compare(SETTINGS, out, ["nearest"], [3], seeds=[0, 1], say=[].append)
     results = Results(out / SETTINGS.env / "cells")
     one, other = (results.read(replace(NEAREST, seed=seed)) for seed in (0, 1))
@@ -113,26 +108,19 @@ def test_seeds_learn_from_demonstrations_of_their_own(whole, tmp_path):
     # which is all that could change what it replays
     assert one["episodes"] != other["episodes"]
     episodes = pd.read_parquet(out / "results.parquet")
-    assert set(zip(episodes.training_seed, episodes.demonstration_seed, strict=True)) == {
-        (0, 0),
-        (1, 1),
-    }
+    drawn = zip(episodes.training_seed, episodes.demonstration_seed, strict=True)
+    assert set(drawn) == {(0, 0), (1, 1)}
 
 
-def test_a_folder_grows_by_an_environment(whole, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+def test_a_folder_grows_by_an_environment(out):
     carry = replace(SETTINGS, env="carry_and_put", episodes=1)
-    said = []
-    conditions = ["nominal", "stopped-1"]
-    arguments = {"conditions": conditions, "say": said.append}
-    result = compare([SETTINGS, carry], out, ["nearest"], [3], **arguments)
+    said, arguments = [], {"conditions": ["nominal", "stopped-1"]}
+    result = compare([SETTINGS, carry], out, ["nearest"], [3], say=said.append, **arguments)
     assert result == Comparison(4, {}), said
     assert said[0] == "4 cells, 1 of them finished before"
     episodes = pd.read_parquet(out / "results.parquet")
     assert dict(episodes.groupby("env").size()) == {"bottle_shaking": 6, "carry_and_put": 1 + 1}
-    report = (out / "report.md").read_text()
-    assert "carry_and_put" in report
+    assert "carry_and_put" in (out / "report.md").read_text()
 
 
 def test_conditions_are_tried_where_they_are_known():
@@ -146,9 +134,7 @@ def test_conditions_are_tried_where_they_are_known():
         choose_conditions(tasks, ["nominal", "rain"], said.append)
 
 
-def test_what_is_finished_is_not_run_again(whole, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+def test_what_is_finished_is_not_run_again(whole, out):
     place, name = out / SETTINGS.env, "training.json"
     results = Results(place / "cells")
     kept = results.path(NEAREST).stat().st_mtime_ns
@@ -168,9 +154,7 @@ def test_what_is_finished_is_not_run_again(whole, tmp_path):
     assert run_comparison(out)[1][0] == "2 cells, 2 of them finished before"
 
 
-def test_conditions_are_tried_with_the_policy_that_is_there(whole, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(whole, out)
+def test_conditions_are_tried_with_the_policy_that_is_there(out):
     place = out / SETTINGS.env
     conditions = ["stopped-1", "moved+pose-stale"]
     policies = ["tpgmm", OPEN_LOOP, "tpgmm --policy.control.follow_frames=true"]
@@ -213,8 +197,7 @@ def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatc
     jobs.run(tmp_path, SETTINGS, [cell])
     result = Results(tmp_path / "cells").read(cell)
     [point] = result["training"]["curve"]
-    assert point["step"] == 5
-    assert 0 < point["validation_error"] < 3
+    assert point["step"] == 5 and 0 < point["validation_error"] < 3
     assert "budget" in result["training"]["outcome"]
     size = recipe.options.get("n_action_steps", 8)
     assert result["latency"]["chunk_size"] == size
@@ -225,10 +208,7 @@ def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatc
     assert width == (40 if "phase" in policy else 7)
 
 
-@pytest.mark.parametrize(
-    "policy",
-    ["key-poses-posture", "mean", "tpgmm-no-joints"],
-)
+@pytest.mark.parametrize("policy", ["key-poses-posture", "mean", "tpgmm-no-joints"])
 def test_what_no_gradient_trains_goes_through_the_same_code(folder, tmp_path, policy):
     shutil.copytree(folder / "episodes", tmp_path / "episodes")
     cell = Cell("bottle_shaking", policy, 2, 0)

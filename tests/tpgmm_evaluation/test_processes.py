@@ -1,7 +1,6 @@
 """Jobs in processes: some fail, some die, and the others go on."""
 
 import os
-import runpy
 import subprocess
 import sys
 import time
@@ -15,28 +14,27 @@ from tpgmm_evaluation.processes import run_jobs
 
 @pytest.mark.slow
 def test_jobs_that_fail_or_die_spare_the_others(tmp_path):
+    done = [tmp_path / name for name in ("2.done", "4.done")]
     texts = (
         "raise ValueError('no such luck')",
         "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
-        "import pathlib; pathlib.Path(__file__).with_suffix('.done').touch()",
+        f"import pathlib; pathlib.Path({str(done[0])!r}).touch()",
         "import sys; sys.exit(3)",
-        "import pathlib; pathlib.Path(__file__).with_suffix('.done').touch()",
+        f"import pathlib; pathlib.Path({str(done[1])!r}).touch()",
     )
-    scripts = [tmp_path / f"{number}.py" for number in range(len(texts))]
-    for script, text in zip(scripts, texts, strict=True):
-        script.write_text(text)
-    logs = [script.with_suffix(".txt") for script in scripts]
     # a function that the other processes can import, unlike those of a test
-    problems = dict(run_jobs(runpy.run_path, [(str(script),) for script in scripts], 2, logs))
-    assert problems == {
-        0: "ValueError: no such luck",
-        1: "its process ended with code -9",
-        2: None,
-        3: "SystemExit: 3",
-        4: None,
+    ended = run_jobs(exec, [(text,) for text in texts], 2)
+    problems = {number: problem for number, _, problem in ended}
+    assert "Traceback" in problems[0]
+    assert {number: text.strip().splitlines()[-1:] for number, text in problems.items()} == {
+        0: ["ValueError: no such luck"],
+        1: ["its process ended with code -9"],
+        2: [],
+        3: ["SystemExit: 3"],
+        4: [],
     }
-    assert "Traceback" in logs[0].read_text()
-    assert {path.name for path in tmp_path.glob("*.done")} == {"2.done", "4.done"}
+    assert all(path.exists() for path in done)
+    assert list(run_jobs(max, [(1, 2)], 1)) == [(0, 2, "")]
 
 
 def test_jobs_end_with_a_run_that_is_killed(tmp_path):
@@ -50,10 +48,9 @@ def test_jobs_end_with_a_run_that_is_killed(tmp_path):
     )
     # as a module of its own, and without what jobs need: it starts quickly
     text = (
-        "import pathlib, runpy, processes\n"
+        "import runpy, processes\n"
         "processes.PRELOADED = 'json'\n"
-        f"jobs, logs = [({str(job)!r},)], [pathlib.Path({str(tmp_path / 'log')!r})]\n"
-        "list(processes.run_jobs(runpy.run_path, jobs, 1, logs))\n"
+        f"list(processes.run_jobs(runpy.run_path, [({str(job)!r},)], 1))\n"
     )
     folder = str(Path(processes.__file__).parent)
     environment = os.environ | {"PYTHONPATH": folder}

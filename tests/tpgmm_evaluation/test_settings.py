@@ -7,15 +7,16 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 
 def test_a_folder_keeps_its_settings(tmp_path):
-    path = tmp_path / "settings.json"
-    settings = Settings(episodes=7)
+    path, settings = tmp_path / "settings.json", Settings(episodes=7)
     settings.keep(path)
     settings.keep(path)
-    with pytest.raises(DataError, match="episodes was 7, now 8"):
-        Settings(episodes=8).keep(path)
+    for other, message in (
+        (Settings(episodes=8), "episodes was 7, now 8"),
+        (Settings(episodes=7, demonstration_seed=0), "demonstration_seed was None, now 0"),
+    ):
+        with pytest.raises(DataError, match=message):
+            other.keep(path)
     assert Settings.read(path) == settings
-    with pytest.raises(DataError, match="demonstration_seed was None, now 0"):
-        Settings(episodes=7, demonstration_seed=0).keep(path)
     path.write_text("{")
     with pytest.raises(DataError, match="not JSON"):
         settings.keep(path)
@@ -37,17 +38,19 @@ def test_each_seed_draws_demonstrations_unless_they_are_fixed(tmp_path):
 
 def test_conditions_become_options_of_the_environment():
     settings = Settings(options={"mode": "kinematic"})
-    assert settings.disturb("nominal") == {"mode": "kinematic"}
-    both = settings.disturb("pushes+noise")
-    assert both == {"mode": "kinematic", "pushes": True, "noise": 1.0}
-    stopped = settings.disturb("stopped-3+noise+live")
-    assert stopped == {"mode": "kinematic", "noise": 1.0, "condition": "stopped-3+live"}
-    with pytest.raises(UnknownNameError, match=r"'rain' is not in the conditions .*stopped-3"):
-        settings.disturb("rain")
-    with pytest.raises(DataError, match="names stopped twice"):
-        settings.disturb("stopped-3+stopped-4")
-    with pytest.raises(UnknownNameError, match="'live' is not in the conditions of aloha"):
-        Settings("aloha_state").disturb("live")
+    for condition, more in (
+        ("nominal", {}),
+        ("pushes+noise", {"pushes": True, "noise": 1.0}),
+        ("stopped-3+noise+live", {"noise": 1.0, "condition": "stopped-3+live"}),
+    ):
+        assert settings.disturb(condition) == {"mode": "kinematic", **more}
+    for given, condition, error, message in (
+        (settings, "rain", UnknownNameError, r"'rain' is not in the conditions .*stopped-3"),
+        (settings, "stopped-3+stopped-4", DataError, "names stopped twice"),
+        (Settings("aloha_state"), "live", UnknownNameError, "'live' is .* conditions of aloha"),
+    ):
+        with pytest.raises(error, match=message):
+            given.disturb(condition)
     with pytest.raises(UnknownNameError, match="environment 'moon'"):
         Settings("moon").benchmark()
 

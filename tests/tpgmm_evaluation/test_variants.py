@@ -10,17 +10,21 @@ from tpgmm_evaluation.variants import OPEN_LOOP, Variant
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 
-def test_a_name_alone_has_no_settings():
-    assert Variant.parse("act") == Variant("act")
-    assert Variant.parse("tpgmm").arguments == []
-
-
-def test_settings_follow_the_name():
-    variant = Variant.parse(
-        "tpgmm --policy.control.feedback=observation --policy.control.blend=0.5"
-    )
-    assert variant == Variant("tpgmm", ("control.feedback=observation", "control.blend=0.5"))
-    assert variant.arguments == ["--control.feedback=observation", "--control.blend=0.5"]
+@pytest.mark.parametrize(
+    ("text", "name", "options"),
+    [
+        ("act", "act", ()),
+        (
+            "tpgmm --policy.control.feedback=observation --policy.control.blend=0.5",
+            "tpgmm",
+            ("control.feedback=observation", "control.blend=0.5"),
+        ),
+    ],
+)
+def test_settings_follow_the_name(text, name, options):
+    variant = Variant.parse(text)
+    assert variant == Variant(name, options)
+    assert variant.arguments == [f"--{option}" for option in options]
 
 
 @pytest.mark.parametrize(

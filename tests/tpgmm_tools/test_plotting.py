@@ -9,16 +9,7 @@ from matplotlib.patches import Ellipse
 from tests.support.local_coordinates import local_coordinates
 from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
 from tests.support.worlds import OnPoses
-from tpgmm_tools.plotting import (
-    figure,
-    plot_candidates,
-    plot_components,
-    plot_joints,
-    plot_local,
-    plot_relevance,
-    save,
-    shade,
-)
+from tpgmm_tools import plotting
 from tpgmm_torch import Demonstration, SelectOperators, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.operators.text import format_operator
@@ -30,7 +21,7 @@ def joints_model() -> TaskParameterizedGMM:
 
 def test_joints_are_drawn_with_bands_and_events_in_the_panels_given():
     [shown, _] = handlings(2)
-    axes = plot_joints(shown, ["left.z", "left.x"], color="k")
+    axes = plotting.plot_joints(shown, ["left.z", "left.x"], color="k")
     assert [panel.get_ylabel() for panel in axes] == ["left.z", "left.x"]
     at = [shown.joint_names.index(name) for name in ("left.z", "left.x")]
     marks = 1 + len(shown.events)
@@ -38,17 +29,17 @@ def test_joints_are_drawn_with_bands_and_events_in_the_panels_given():
         assert len(panel.lines) == marks
         np.testing.assert_array_equal(panel.lines[0].get_ydata(), shown.joints[:, column])
     [trajectory] = hands().predict([shown])
-    assert plot_joints(trajectory, ["left.z", "left.x"], axes) == axes
+    assert plotting.plot_joints(trajectory, ["left.z", "left.x"], axes) == axes
     [band] = axes[0].collections
     high = trajectory.joints[:, at[0]] + 2 * trajectory.covariance[:, at[0], at[0]].sqrt()
     assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(float(high.max()))
     with pytest.raises(UnknownNameError, match="knee"):
-        plot_joints(shown, ["knee"])
+        plotting.plot_joints(shown, ["knee"])
 
 
 def test_components_are_contours_of_one_standard_deviation():
-    model, [axes] = joints_model(), figure(1, "").axes
-    plot_components(axes, model, operator=0, column=1)
+    model, [axes] = joints_model(), plotting.figure(1, "").axes
+    plotting.plot_components(axes, model, operator=0, column=1)
     ellipses = [p for p in axes.patches if isinstance(p, Ellipse)]
     assert len(ellipses) == 4
     plane = [0, 2]
@@ -67,10 +58,10 @@ def test_components_are_contours_of_one_standard_deviation():
 
 
 def test_local_coordinates_are_those_of_the_operator():
-    demonstrations, [axes] = handlings(2), figure(1, "").axes
+    demonstrations, [axes] = handlings(2), plotting.figure(1, "").axes
     [trajectory] = hands().predict(demonstrations[:1])
     reproduction = trajectory, demonstrations[0].frames, {"linestyle": "--"}
-    plot_local(axes, hands(), 0, 2, demonstrations, [reproduction])
+    plotting.plot_local(axes, hands(), 0, 2, demonstrations, [reproduction])
     motion = Demonstration(trajectory.time, trajectory.joints, demonstrations[0].frames)
     assert len(axes.lines) == 3
     for line, source in zip(axes.lines, [*demonstrations, motion], strict=True):
@@ -83,11 +74,11 @@ def test_local_coordinates_are_those_of_the_operator():
 
 
 def test_quaternions_are_drawn_on_the_side_of_the_components():
-    [demonstration], [axes] = handlings(1), figure(1, "").axes
+    [demonstration], [axes] = handlings(1), plotting.figure(1, "").axes
     flipped = Demonstration(
         demonstration.time, OnPoses().flipped_answer(demonstration.joints), demonstration.frames
     )
-    plot_local(axes, hands(), 0, 3, [demonstration, flipped])
+    plotting.plot_local(axes, hands(), 0, 3, [demonstration, flipped])
     one, other = (line.get_ydata() for line in axes.lines)
     np.testing.assert_allclose(one, other)
     means = hands().means_[0][:, 4].numpy()
@@ -95,9 +86,9 @@ def test_quaternions_are_drawn_on_the_side_of_the_components():
 
 
 def test_candidates_are_drawn_with_their_spread():
-    model, [axes] = joints_model(), figure(1, "").axes
+    model, [axes] = joints_model(), plotting.figure(1, "").axes
     [trajectory] = model.predict([Situation([0.0, 1.0, 0.0])])
-    plot_candidates(axes, trajectory, "b", ["canonical"])
+    plotting.plot_candidates(axes, trajectory, "b", ["canonical"])
     candidate, column = trajectory.candidates[0], JOINT_NAMES.index("b")
     own, result = axes.lines
     np.testing.assert_array_equal(own.get_ydata(), candidate.mean[:, column])
@@ -117,9 +108,9 @@ def test_candidates_are_drawn_with_their_spread():
 def test_a_figure_is_written_in_vectors_with_fonts_that_publishers_take(
     suffix, magic, tmp_path
 ):
-    drawing = figure(1, "a title")
-    shade(drawing.axes[0], {"reach": (0.0, 1.0)})
-    written = save(drawing, tmp_path / f"figure.{suffix}").read_bytes()
+    drawing = plotting.figure(1, "a title")
+    plotting.shade(drawing.axes[0], {"reach": (0.0, 1.0)})
+    written = plotting.save(drawing, tmp_path / f"figure.{suffix}").read_bytes()
     assert written.startswith(magic)
     assert b"<image" not in written and b"/Subtype /Image" not in written
     assert b"/Subtype /Type3" not in written
@@ -127,16 +118,14 @@ def test_a_figure_is_written_in_vectors_with_fonts_that_publishers_take(
 
 def test_candidates_that_matter_stand_above_the_others():
     selection = SelectOperators(robot=HANDS).fit(handlings())
-    [axes] = figure(1, "").axes
-    plot_relevance(axes, selection)
+    [axes] = plotting.figure(1, "").axes
+    plotting.plot_relevance(axes, selection)
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    kept = {
-        format_operator(selection.candidates_[j]) for j in np.flatnonzero(selection.support_)
-    }
+    names = [format_operator(one) for one in selection.candidates_]
+    kept = {names[j] for j in np.flatnonzero(selection.support_)}
     assert set(labels[: len(kept)]) == kept and len(labels) == len(selection.candidates_)
     [image] = axes.images
-    column = [format_operator(one) for one in selection.candidates_].index(labels[0])
-    np.testing.assert_allclose(
-        image.get_array()[0], selection.relevance_[:, column].clip(min=0)
-    )
+    column = names.index(labels[0])
+    wanted = selection.relevance_[:, column].clip(min=0)
+    np.testing.assert_allclose(image.get_array()[0], wanted)
     assert [line.get_ydata()[0] for line in axes.lines] == [len(kept) - 0.5]

@@ -23,7 +23,6 @@ CASES = [
     (Interval(Integral, 1, None, closed="left"), [1, np.int8(3)], [0, 1.0, True, "1"]),
     (Options("time", "random"), ["time", np.str_("random")], ["Time", "", None, b"time"]),
     ("array-like", [[], (1,), np.ones(2), torch.ones(2), {}], ["ab", b"ab", 1, None, list]),
-    ("boolean", [True, np.False_], [0, 1, "yes", None]),
     ("random_state", [None, 0, 2**32 - 1, np.random.RandomState(0)], [-1, 2**32, 1.0, "0"]),
     (None, [None], [0, False, ""]),
     (dict, [{}], [[], dict]),

@@ -209,17 +209,13 @@ SINGULAR = torch.tensor([[1.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
 REGULAR = torch.eye(2, dtype=torch.float64)
 
 
-@pytest.mark.parametrize(
-    ("call", "name"),
-    [
-        (lambda c: gaussians.cholesky(c, "the thing"), "the thing"),
-        (lambda c: gaussians.product(torch.zeros(2, 2).double(), c), "a factor of the product"),
-        (lambda c: gaussians.information(None, torch.zeros(2, 1).double(), c), "projected"),
-        (lambda c: gaussians.information(REGULAR, torch.zeros(2, 1).double(), c), "projected"),
-        (lambda c: gaussians.from_information(c, torch.zeros(2, 2).double()), "precision"),
-    ],
-    ids=["cholesky", "product", "information", "information with J", "from_information"],
-)
+@pytest.mark.parametrize(("call", "name"), [
+    (lambda c: gaussians.cholesky(c, "the thing"), "the thing"),
+    (lambda c: gaussians.product(torch.zeros(2, 2).double(), c), "a factor of the product"),
+    (lambda c: gaussians.information(None, torch.zeros(2, 1).double(), c), "projected"),
+    (lambda c: gaussians.information(REGULAR, torch.zeros(2, 1).double(), c), "projected"),
+    (lambda c: gaussians.from_information(c, torch.zeros(2, 2).double()), "precision"),
+], ids=["cholesky", "product", "information", "with J", "from_information"])  # fmt: skip
 @pytest.mark.parametrize("bad", [SINGULAR - 1e-3 * REGULAR, torch.full((2, 2), torch.nan)])
 def test_a_singular_matrix_is_named_counted_and_comes_with_advice(call, name, bad):
     with pytest.raises(DataError, match=rf"{name}.*1 of 2 matrices of size 2.*reg_covar"):
@@ -241,21 +237,13 @@ def test_the_pseudo_inverse_is_moore_and_penrose_s_at_any_rank(smallest, dtype):
     values = torch.ones(5, 6, dtype=torch.float64)
     values[2, 4] = smallest  # one of them may lack a direction
     matrix = ((left * values[:, None]) @ right.mT).to(dtype)
-    expected = torch.linalg.pinv(matrix)
-    found = gaussians.pseudo_inverse(matrix)
-    tolerance = torch.finfo(dtype).eps ** (2 / 3) * expected.abs().max()
-    torch.testing.assert_close(found, expected, rtol=0, atol=float(tolerance))
-    matrix[3, :, 5] = matrix[3, 2] = 0.0  # a coordinate or a row that is not there at all
-    torch.testing.assert_close(
-        gaussians.pseudo_inverse(matrix),
-        torch.linalg.pinv(matrix),
-        rtol=0,
-        atol=float(tolerance),
-    )
-    tall = gaussians.pseudo_inverse(matrix.mT)
-    torch.testing.assert_close(
-        tall, torch.linalg.pinv(matrix.mT), rtol=0, atol=float(tolerance)
-    )
+    tolerance = torch.finfo(dtype).eps ** (2 / 3) * torch.linalg.pinv(matrix).abs().max()
+    lacking = matrix.clone()  # a coordinate or a row that is not there at all
+    lacking[3, :, 5] = lacking[3, 2] = 0.0
+    for one in (matrix, lacking, lacking.mT):
+        found = gaussians.pseudo_inverse(one)
+        expected = torch.linalg.pinv(one)
+        torch.testing.assert_close(found, expected, rtol=0, atol=float(tolerance))
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (3, 0, 5), (0, 2, 5), (5, 0)])

@@ -144,9 +144,8 @@ def test_a_net_folds_to_its_cube(size, tmp_path):
                 left.append(other)
     flat = {n: np.c_[c, np.zeros(4), np.ones(4)] for n, c in found.items()}
     for number, corners in cube(numbers, size).corners.items():
-        np.testing.assert_allclose(
-            (flat[number] @ folded[number].T)[:, :3], corners * 1e3, atol=0.15
-        )
+        there = (flat[number] @ folded[number].T)[:, :3]
+        np.testing.assert_allclose(there, corners * 1e3, atol=0.15)
     # each of the other edges of the cube has one flap
     flaps, joints = [points for points, _ in lines if len(points) == 4], set()
     for points in flaps:
@@ -163,9 +162,8 @@ def test_a_net_folds_to_its_cube(size, tmp_path):
     for outline in [*flaps, *(cell + square for cell in cells.values())]:
         middle = outline.mean(0)
         inner = 100 * (middle + 0.98 * (outline - middle)) + 200
-        covered += cv2.fillPoly(
-            np.zeros(covered.shape, dtype=np.uint8), [np.rint(inner).astype(int)], 1
-        )
+        blank = np.zeros(covered.shape, dtype=np.uint8)
+        covered += cv2.fillPoly(blank, [np.rint(inner).astype(int)], 1)
     assert covered.max() == 1
 
 
@@ -183,9 +181,8 @@ def test_five_numbers_leave_the_face_below_free(tmp_path):
 def test_a_board_is_seen_whole_and_in_true_size(page, board, tmp_path):
     assert print_targets(tmp_path / "board.pdf", board=board, page=page) == []
     [sheet] = pdf_pages(tmp_path / "board.pdf")
-    corners, numbers, markers, _ = cv2.aruco.CharucoDetector(board.drawn).detectBoard(
-        sheet.picture(DPI)
-    )
+    detector = cv2.aruco.CharucoDetector(board.drawn)
+    corners, numbers, markers, _ = detector.detectBoard(sheet.picture(DPI))
     assert len(numbers) == (board.columns - 1) * (board.rows - 1)
     assert len(markers) == board.columns * board.rows // 2
     found = corners.reshape(-1, 2) / DPI * 25.4
@@ -237,9 +234,8 @@ def test_users_settings_of_matplotlib_change_nothing(tmp_path):
     import matplotlib
 
     print_targets(tmp_path / "usual.pdf", [1])
-    with matplotlib.rc_context(
-        {"savefig.bbox": "tight", "font.size": 30, "lines.linewidth": 9}
-    ):
+    mine = {"savefig.bbox": "tight", "font.size": 30, "lines.linewidth": 9}
+    with matplotlib.rc_context(mine):
         print_targets(tmp_path / "set.pdf", [1])
     [usual], [other] = pdf_pages(tmp_path / "usual.pdf"), pdf_pages(tmp_path / "set.pdf")
     assert (usual.width, usual.height) == (other.width, other.height)

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
+from tpgmm_torch import operators as kinds
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
-from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_operators import SelectOperators
 from tpgmm_torch.training.local_data import local_data
@@ -136,7 +138,41 @@ def _label(operator: Operator) -> str:
             for names in (operator.links(), operator.references())
         )
         return f"{links} from {frames}" if frames else links
-    return "joints" if operator == Canonical() else format_operator(operator)
+    return "joints" if operator == kinds.Canonical() else format_operator(operator)
+
+
+def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
+    """Return a label for each local coordinate of an operator.
+
+    Parameters
+    ----------
+    operator, kinematics : Operator, Kinematics
+        Whose coordinates, for which robot.
+    """
+    return [name for one in operator.leaves for name in _leaf_names(one, kinematics)]
+
+
+def _leaf_names(operator: Any, kinematics: Kinematics) -> list[str]:
+    """Label joints and forces, and leave all else to those of poses."""
+    names, link = kinematics.joint_names, (*operator.links(), "")[0]
+    if operator.is_posture:
+        return [names[column] for column in operator.columns(names)]
+    if operator.constrains_joints:
+        return _pose_names(operator, kinematics, link)
+    forces = [f"{link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
+    return [*forces, f"{link}\ncontact"]
+
+
+def _pose_names(operator: Operator, kinematics: Kinematics, link: str) -> list[str]:
+    """Label metres, parts of rotation vectors and of quaternions, and number all else."""
+    count = operator.dimension(kinematics)
+    if operator.units(kinematics) == ("m",) * 3:
+        return [f"{link}\n{axis} [m]" for axis in "xyz"]
+    if count == 3 and operator.rotation_vector_starts(kinematics) == (0,):
+        return [f"{link}\nrotation {axis} [rad]" for axis in "xyz"]
+    if count == 4 and operator.quaternion_starts(kinematics) == (0,):
+        return [f"{link}\nq{part}" for part in "wxyz"]
+    return [f"coordinate {i + 1}" for i in range(count)]
 
 
 def legend(drawing: Figure) -> None:

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 from textwrap import fill
 from typing import Any
 
@@ -17,8 +18,7 @@ import numpy as np
 from sklearn.base import clone
 
 from tpgmm_control.loop.rollout import rollout
-from tpgmm_control.obstacles import Scene
-from tpgmm_tools.contacts import contacts
+from tpgmm_control.obstacles import Contact, Scene, find_contacts
 from tpgmm_tools.plotting import figure, legend, operator_labels, plot_candidates, save
 from tpgmm_tools.viewing import write_motion
 from tpgmm_tools.viewing.curves import motion_marks, turning_joints
@@ -26,6 +26,7 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.checks.summary import UNLIKELY
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, Situation
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
@@ -187,15 +188,34 @@ def write_report(
         "How it was learned": learning,
     }
     text = "".join(f"<h2>{name}</h2>{part}" for name, part in parts.items() if part)
-    style = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
-    page = (
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f'<meta name=viewport content="width=device-width"><style>\n{style}</style>'
-        f"<h1>{html.escape(title)}</h1>{text}</html>"
-    )
+    page = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
     with replacing(path) as new:
-        new.write_text(page, encoding="utf-8")
+        filled = page.substitute(title=html.escape(title), text=text)
+        new.write_text(filled, encoding="utf-8")
     return left_out
+
+
+def contacts(
+    scene: Scene,
+    motions: Iterable[Trajectory],
+    situations: Iterable[Situation],
+    holds: Sequence[Hold],
+) -> Iterator[tuple[int, Contact]]:
+    """Find contacts in motions, each in its situation, with the number of the motion.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the obstacles.
+    motions, situations : iterable of Trajectory, iterable of Situation
+        As many of each.
+    holds : sequence of Hold
+        What the robot holds meanwhile.
+    """
+    for number, (one, situation) in enumerate(zip(motions, situations, strict=True)):
+        frames = situation.frames_at(one.time.cpu())
+        for contact in find_contacts(scene, one.time, one.joints, frames, holds):
+            yield number, contact
 
 
 def _quantiles(

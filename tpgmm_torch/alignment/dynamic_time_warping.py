@@ -212,8 +212,7 @@ class DynamicTimeWarping(Alignment):
         path, _ = warping_path(self._target, source, self.penalty, self.max_slope)
         step = (self._clock[-1] - self._clock[0]) / (len(self._clock) - 1)
         warp = warping_map(path, round(self.smoothing / step))
-        instants: Array = np.interp(warp, np.arange(len(warp)), self._linear(demonstration))
-        return instants
+        return np.asarray(np.interp(warp, np.arange(len(warp)), self._linear(demonstration)))
 
     def _reason_against(self, demonstration: Demonstration, warp: Array) -> str:
         """Tell why a demonstration should rather run linearly; empty if it should not."""
@@ -244,8 +243,7 @@ class DynamicTimeWarping(Alignment):
     def _on_grid(self, demonstration: Demonstration, warp: Array, reason: str) -> Array:
         """Compute instants on the grid, linear where there is a reason against warping."""
         chosen = self._linear(demonstration) if reason else warp
-        instants: Array = np.interp(self.time_.numpy(), self._clock, chosen)
-        return instants
+        return np.asarray(np.interp(self.time_.numpy(), self._clock, chosen))
 
     def _path(self, demonstration: Demonstration) -> Array:
         warp = self._warp(demonstration, self._features(demonstration))

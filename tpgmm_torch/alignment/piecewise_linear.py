@@ -82,10 +82,8 @@ class LinearTimeNormalization(Alignment):
         return as_array(demonstration.time)[[0, -1]]
 
     def _path(self, demonstration: Demonstration) -> Array:
-        path: Array = np.interp(
-            self.time_.numpy(), self._instants, self._anchors(demonstration)
-        )
-        return path
+        anchors = self._anchors(demonstration)
+        return np.asarray(np.interp(self.time_.numpy(), self._instants, anchors))
 
 
 class EventAlignment(LinearTimeNormalization):
@@ -282,8 +280,7 @@ class EventAlignment(LinearTimeNormalization):
                 inside = (grid >= begin) & (grid <= end)
                 clock = np.linspace(begin, end, len(path))
                 evenly[inside] = np.interp(grid[inside], clock, path)
-        instants: Array = np.interp(evenly, self._instants, self._anchors(demonstration))
-        return instants
+        return np.asarray(np.interp(evenly, self._instants, self._anchors(demonstration)))
 
 
 def _check_event(

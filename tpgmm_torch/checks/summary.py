@@ -14,7 +14,7 @@ from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.checks.training import EpisodeSummary, PathSummary, differing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import FEWEST
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -86,8 +86,7 @@ class Region:
         offset = vectors - np.array(self.mean)
         precision = np.linalg.inv(np.array(self.covariance).reshape(d, d))
         squared = np.einsum("...i,ij,...j->...", offset, precision, offset)
-        distance: Array = np.sqrt(squared / (d + 2 * np.sqrt(2 * d)))
-        return distance
+        return np.asarray(np.sqrt(squared / (d + 2 * np.sqrt(2 * d))))
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class FrameSummary:
             raise DataError(f"a frame is at LINK@EVENT, got {self.at!r:.60}")
 
     @classmethod
-    def of(cls, paths: Sequence[PathSummary], links: Mapping[str, Frame]) -> Self:
+    def of(cls, paths: Sequence[PathSummary], links: Frames) -> Self:
         """Summarise the poses of a frame in all demonstrations.
 
         Parameters
@@ -213,7 +212,7 @@ class TrainingSummary:
 
     def __post_init__(self) -> None:
         n, count = len(self.joint_names), self.n_demonstrations
-        compared = _count_indices(self.compared, n)
+        compared = sum(type(value) is int and 0 <= value < n for value in {*self.compared})
         _check_numbers(
             self,
             n_demonstrations=(),
@@ -264,7 +263,7 @@ class TrainingSummary:
             differing(np.concatenate([one.postures for one in episodes])).round(4).tolist(),
         )
 
-    def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
+    def novelty(self, joints: Any = None, frames: Frames | None = None) -> Array:
         """Measure the distance from the demonstrations, in units of the furthest of these.
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
@@ -318,9 +317,7 @@ class TrainingSummary:
         state = kinematics.state(joints)
         return {name: state.pose(link) for name, link in links.items()}
 
-    def findings(
-        self, joints: Any, frames: Mapping[str, Frame], label: str = ""
-    ) -> list[Finding]:
+    def findings(self, joints: Any, frames: Frames, label: str = "") -> list[Finding]:
         """Name the coordinates of one situation that make it unlike the demonstrations.
 
         Parameters
@@ -385,9 +382,7 @@ class TrainingSummary:
             ) from error
         return summary
 
-    def _distances(
-        self, joints: Any, frames: Mapping[str, Frame]
-    ) -> dict[tuple[str, str], Array]:
+    def _distances(self, joints: Any, frames: Frames) -> dict[tuple[str, str], Array]:
         """Compute distances (...) of situations from each region, by its kind and frame."""
         found: dict[tuple[str, str], Array] = {}
         if joints is not None and len(self.compared):
@@ -477,8 +472,7 @@ def _norm(distances: Iterable[Array]) -> Array:
     total = np.zeros(())
     for distance in distances:
         total = total + np.where(np.isnan(distance), 0.0, distance) ** 4
-    joined: Array = total ** (1 / 4)
-    return joined
+    return np.asarray(total ** (1 / 4))
 
 
 def _rows(joints: Any) -> Array:
@@ -516,11 +510,6 @@ def _rotation_vectors(mean: Array, orientations: Array) -> Array:
         quaternions.conjugate(torch.from_numpy(mean)), torch.from_numpy(np.array(orientations))
     )
     return as_array(quaternions.log(turns))
-
-
-def _count_indices(values: Iterable[Any], n: int) -> int:
-    """Count the different integers from 0 to n - 1 among values."""
-    return sum(type(value) is int and 0 <= value < n for value in {*values})
 
 
 def _check_numbers(thing: Any, **shapes: tuple[int, ...]) -> None:

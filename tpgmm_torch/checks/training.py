@@ -143,10 +143,11 @@ def differing(postures: Array) -> Array:
     -------
     ndarray of shape (P, n_joints)
     """
-    away, chosen = np.abs(postures - postures[0]).max(1), [0]
+    columns = np.ascontiguousarray(postures.T)  # of which the largest is sooner found
+    away, chosen = np.abs(columns - columns[:, :1]).max(0), [0]
     while len(chosen) < POSTURES and away.max(initial=0.0) > 0:
         chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.abs(postures - postures[chosen[-1]]).max(1))
+        away = np.minimum(away, np.abs(columns - columns[:, chosen[-1:]]).max(0))
     return postures[chosen]
 
 

@@ -64,5 +64,4 @@ def _check_finite(tensor: Tensor, name: str) -> None:
 
 def as_array(tensor: Tensor) -> Array:
     """Convert a ``tensor``, without its gradient, to an array of float64."""
-    array: Array = tensor.detach().cpu().double().numpy()
-    return array
+    return np.asarray(tensor.detach().cpu().double().numpy())

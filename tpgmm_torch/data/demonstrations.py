@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import as_tensor
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
@@ -40,7 +40,7 @@ def _check_time(values: Any) -> Tensor:
     return time
 
 
-def _check_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
+def _check_frames(frames: Frames | None, length: int | None) -> dict[str, Frame]:
     """Check types and lengths; without ``length``, frames per time step share one."""
     frames = dict(frames or {})
     for name, frame in frames.items():
@@ -129,7 +129,7 @@ class Demonstration:
 
     time: Tensor
     joints: Tensor
-    frames: Mapping[str, Frame] = field(default_factory=dict)
+    frames: Frames = field(default_factory=dict)
     joint_names: tuple[str, ...] | None = None
     events: Mapping[str, float] = field(default_factory=dict)
     holds: tuple[Hold, ...] | None = None
@@ -278,7 +278,7 @@ class Situation:
     """
 
     joints: Tensor
-    frames: Mapping[str, Frame] = field(default_factory=dict)
+    frames: Frames = field(default_factory=dict)
     time: Tensor | None = None
     joint_names: tuple[str, ...] | None = None
     frames_time: Tensor | None = None

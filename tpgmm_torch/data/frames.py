@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -213,3 +213,7 @@ class Frame:
         frame = cls.__new__(cls)
         vars(frame).update(position=position, orientation=orientation)
         return frame
+
+
+#: Poses of objects by name, one for each or one for each time step.
+Frames = Mapping[str, Frame]

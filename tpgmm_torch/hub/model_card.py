@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from inspect import signature
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.reproduction import reproduce
+from tpgmm_torch.skills.skill import CompositeSkill, Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
 
@@ -38,7 +38,7 @@ model = hub.load("{repo_id}")
 
 
 def model_card(
-    model: Any,
+    model: TaskParameterizedGMM | Skill,
     repo_id: str,
     *,
     measured: Mapping[str, object] | None = None,
@@ -75,7 +75,9 @@ def model_card(
     return "\n\n".join(parts) + "\n"
 
 
-def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
+def describe(
+    model: TaskParameterizedGMM | Skill, measured: Mapping[str, object] | None = None
+) -> str:
     """Return the sections of a card that follow from the model itself, as Markdown.
 
     Parameters
@@ -89,7 +91,9 @@ def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
     return "\n\n".join(f"## {title}\n\n{text}" for title, text in chapters)
 
 
-def sections(model: Any, measured: Mapping[str, object] | None = None) -> dict[str, str]:
+def sections(
+    model: TaskParameterizedGMM | Skill, measured: Mapping[str, object] | None = None
+) -> dict[str, str]:
     """Text of each section of :func:`describe`, by its title.
 
     Parameters
@@ -112,13 +116,13 @@ def sections(model: Any, measured: Mapping[str, object] | None = None) -> dict[s
     return found | {"Measured": figures, "How it was learned": _learning(model)}
 
 
-def _parts(skill: Any, name: str = "") -> Iterator[tuple[str, Regression]]:
+def _parts(skill: Skill, name: str = "") -> Iterator[tuple[str, Regression]]:
     """Return the fitted mixtures of a skill, by the name that each has among them."""
     if isinstance(skill, Regression):
         yield name, skill
     elif isinstance(skill, ViaPoints):
         yield from _parts(skill.skill, name)
-    else:
+    elif isinstance(skill, CompositeSkill):
         kind = "way" if isinstance(skill, Ways) else "part"
         for number, one in enumerate(skill.skills, start=1):
             yield from _parts(one, f"{name}, {kind} {number}".lstrip(", "))
@@ -215,7 +219,7 @@ def _limits(skill: Regression) -> str:
     return "\n\n".join(parts)
 
 
-def _learning(model: Any) -> str:
+def _learning(model: TaskParameterizedGMM | Skill) -> str:
     rows: list[tuple[str, object]] = []
     if isinstance(model, TaskParameterizedGMM):
         rows.append(("iterations of EM", model.n_iter_))

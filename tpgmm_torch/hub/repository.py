@@ -10,9 +10,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from tpgmm_torch import persistence
+from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 from tpgmm_torch.hub.model_card import model_card
 from tpgmm_torch.persistence import FILES, save
+from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["load", "push"]
 
@@ -21,7 +23,7 @@ REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 
 
 def push(
-    model: Any,
+    model: TaskParameterizedGMM | Skill,
     repo_id: str,
     *,
     measured: Mapping[str, object] | None = None,
@@ -71,7 +73,7 @@ def load(
     token: str | None = None,
     custom: Sequence[type] = (),
     device: str | None = None,
-) -> Any:
+) -> TaskParameterizedGMM | Skill:
     """Load a model or a skill from the Hugging Face hub, or a folder; nothing is executed.
 
     Parameters

@@ -26,14 +26,7 @@ from tpgmm_torch.exceptions import (
     NotFittedError,
     ShapeError,
 )
-from tpgmm_torch.mixture.expectation_maximization import (
-    CovarianceFamily,
-    Fit,
-    Parameters,
-    expectation_maximization,
-    log_joint,
-    whiten,
-)
+from tpgmm_torch.mixture import expectation_maximization as em
 from tpgmm_torch.mixture.initialization import draw_starts
 from tpgmm_torch.mixture.points import Points
 from tpgmm_torch.mixture.processes import ALONE, Processes
@@ -208,7 +201,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         if bool((shares < 0).any()) or abs(float(shares.sum()) - 1) > 1e-3:
             raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
         moments = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
-        whiten(parameters := Parameters(shares / shares.sum(), *moments))
+        em.whiten(parameters := em.Parameters(shares / shares.sum(), *moments))
         return model._set(parameters)
 
     def fit(
@@ -264,9 +257,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         if processes.count > 1 and not isinstance(seed, Integral):
             seed = processes.gather(check_random_state(seed).randint(2**31))[0]
         rng = check_random_state(seed)
-        starts = self._starts(start, points, family, shift, scale, rng)
+        starts = self._starts(start, points, family, rng)
         fits = [
-            expectation_maximization(
+            em.expectation_maximization(
                 begin, points, family, RandomState(rng.randint(2**31 - 1)),
                 tol=self.tol, max_iter=self.max_iter,
             )
@@ -283,11 +276,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self,
         start: BlockGaussianMixture | None,
         points: Points,
-        family: CovarianceFamily,
-        shift: Tensor,
-        scale: Tensor,
+        family: em.CovarianceFamily,
         rng: RandomState,
-    ) -> list[Parameters]:
+    ) -> list[em.Parameters]:
         """Choose where EM begins, in standardised units."""
         if start is None:
             settings = self.init_params, self.n_init, self.n_components
@@ -298,7 +289,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 f"the start has {given[0]} components in blocks of {given[1]} columns, "
                 f"asked for are {self.n_components} in blocks of {points.widths}"
             )
-        return [family.admit(start._parameters().affine(1 / scale, -shift / scale))]
+        standard = 1 / points.scale, -points.shift / points.scale
+        return [family.admit(start._parameters().affine(*standard))]
 
     def _rows(self, X: Any) -> Rows:
         """Check the rows of X."""
@@ -324,7 +316,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             )
         return list(map(int, widths))
 
-    def _family(self, widths: list[int]) -> CovarianceFamily:
+    def _family(self, widths: list[int]) -> em.CovarianceFamily:
         """Make the family of admitted covariances, in standardised units."""
         shares = np.asarray(self.reg_covar, dtype=np.float64)
         if shares.shape not in ((), (sum(widths),)):
@@ -338,9 +330,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             )
         smallest = SMALLEST_SHARE[getattr(torch, self.dtype)]
         diagonal = torch.from_numpy(np.broadcast_to(shares, sum(widths)).clip(min=smallest))
-        return CovarianceFamily(self.covariance_type, diagonal.to(self.device).split(widths))
+        return em.CovarianceFamily(self.covariance_type, diagonal.to(self.device).split(widths))
 
-    def _set(self, parameters: Parameters) -> Self:
+    def _set(self, parameters: em.Parameters) -> Self:
         """Set the mixture in units of the data."""
         target = {"dtype": getattr(torch, self.dtype), "device": torch.device(self.device)}
         self.weights_ = parameters.weights.to(**target)
@@ -430,7 +422,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             columns.append(mean.cpu().numpy()[labels] + (factor[labels] @ normal)[..., 0])
         return np.concatenate(columns, axis=1).astype(self.dtype), labels
 
-    def _parameters(self) -> Parameters:
+    def _parameters(self) -> em.Parameters:
         """Return the fitted mixture in float64."""
         if not hasattr(self, "weights_"):
             raise NotFittedError(
@@ -439,7 +431,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         doubled = (
             tuple(x.double() for x in blocks) for blocks in (self.means_, self.covariances_)
         )
-        return Parameters(self.weights_.double(), *doubled)
+        return em.Parameters(self.weights_.double(), *doubled)
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
         """Apply a function to the log of weight times density, (K, n), of the rows."""
@@ -447,7 +439,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
         # centred, so that offsets cost no digits
         center = torch.cat([parameters.weights @ mean for mean in parameters.means])
-        exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
+        exact, peaks = em.whiten(parameters.affine(torch.ones_like(center), -center))
         maps, peaks = [block_map.to(dtype) for block_map in exact], peaks.to(dtype)
         widths, found = [block_map.shape[1] for block_map in maps], []
         for start in range(0, len(points), FILE_ROWS):
@@ -456,7 +448,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 torch.nn.functional.pad(block, (0, 1), value=1.0).T.to(dtype)
                 for block in (rows - center).split(widths, 1)
             ]
-            found.append(reduce(log_joint(blocks, maps, peaks)[0]).cpu().numpy())
+            found.append(reduce(em.log_joint(blocks, maps, peaks)[0]).cpu().numpy())
         return np.concatenate(found)
 
 
@@ -469,7 +461,7 @@ def _on_cpu(X: Any) -> Any:
     return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
 
 
-def _warn(fit: Fit) -> None:
+def _warn(fit: em.Fit) -> None:
     """Warn of what the user should know of the best start."""
     if fit.reseedings:
         warnings.warn(

@@ -233,25 +233,18 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     least : Tensor of shape (n_chunks,), optional
         That of the last pass; without it all components are evaluated at all points.
     """
-    maps, peaks = whiten(parameters)
-    ceilings = _ceilings(parameters, peaks, points.spans)
+    found, lowest = _Pass(parameters, points), list[float]()
+    ceilings = _ceilings(parameters, found.peaks, points.spans)
     if least is None:
         least = torch.full_like(ceilings[:, 0], -math.inf)
     limits = torch.minimum(least, ceilings.amax(1)) - (NEGLIGIBLE + MARGIN)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
-    rounded, heights = (
-        [block_map.to(points.dtype) for block_map in maps],
-        peaks.to(points.dtype),
-    )
-    found, lowest = _Sums.zero(maps, peaks), []
-    for (chunk, _), index, limit, ceiling in zip(
-        points, chosen, limits.tolist(), ceilings, strict=True
-    ):
+    every = zip(points, chosen, limits.tolist(), ceilings, strict=True)
+    for (chunk, _), index, limit, ceiling in every:
         blocks = points.blocks(chunk)
         while True:
-            near = [block_map[index] for block_map in rounded], heights[index]
-            joint, whitened = log_joint(blocks, *near, points.group_size)
+            joint, whitened = found.log_joint(blocks, index, points.group_size)
             density = joint.logsumexp(0)
             lowest.append(float(density.min()))
             if not limit > lowest[-1] - NEGLIGIBLE:  # nor where it is NaN
@@ -261,8 +254,8 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
         # products with denormal numbers take very long
         gamma = joint.sub_(density).clamp_(min=-2 * NEGLIGIBLE).exp_()
         found.add(index, gamma, blocks, whitened)
-        found.total += density.sum(dtype=peaks.dtype)
-    return found.expectation(parameters, rounded, points, limits.new_tensor(lowest))
+        found.total += density.sum(dtype=found.total.dtype)
+    return found.expectation(limits.new_tensor(lowest))
 
 
 def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expectation:
@@ -282,36 +275,34 @@ def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expe
     ones = [torch.diag_embed(torch.ones_like(mean)) for mean in zeros]
     shares = like.new_full((n_components,), 1 / n_components)
     unit = Parameters(shares, tuple(zeros), tuple(ones))
-    maps, peaks = whiten(unit)
-    rounded, heights = (
-        [block_map.to(points.dtype) for block_map in maps],
-        peaks.to(points.dtype),
-    )
-    found = _Sums.zero(maps, peaks)
+    found = _Pass(unit, points)
     for chunk, numbers in points:
         labels = labeller(chunk[points.values].T, numbers)
         index, places = labels.unique(return_inverse=True)
         blocks = points.blocks(chunk)
-        joint, whitened = log_joint(blocks, [m[index] for m in rounded], heights[index])
+        joint, whitened = found.log_joint(blocks, index)
         gamma = torch.nn.functional.one_hot(places, len(index)).T.to(joint)
         found.add(index, gamma, blocks, whitened)
-    return found.expectation(unit, rounded, points, points.spans.new_zeros(len(points.spans)))
+    return found.expectation(points.spans.new_zeros(len(points.spans)))
 
 
-@dataclass
-class _Sums:
-    """Sums over points of one process."""
+class _Pass:
+    """One pass over the points of this process: what whitens them, and sums over them."""
 
-    mass: Tensor
-    total: Tensor
-    moments: list[Tensor]
+    def __init__(self, parameters: Parameters, points: Points) -> None:
+        self.parameters, self.points = parameters, points
+        maps, self.peaks = whiten(parameters)
+        self.maps = [block_map.to(points.dtype) for block_map in maps]
+        self._heights = self.peaks.to(points.dtype)
+        self.mass, self.total = torch.zeros_like(self.peaks), torch.zeros_like(self.peaks[0])
+        self.moments = [one.new_zeros(one.shape[2], *one.shape[:2]) for one in maps]
 
-    @classmethod
-    def zero(cls, maps: Sequence[Tensor], peaks: Tensor) -> _Sums:
-        moments = [
-            block_map.new_zeros(block_map.shape[2], *block_map.shape[:2]) for block_map in maps
-        ]
-        return cls(torch.zeros_like(peaks), torch.zeros_like(peaks[0]), moments)
+    def log_joint(
+        self, blocks: Sequence[Tensor], index: Tensor | slice, group_size: int = 1
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Compute :func:`log_joint` of some components."""
+        near = [block_map[index] for block_map in self.maps], self._heights[index]
+        return log_joint(blocks, *near, group_size)
 
     def add(
         self, index: Tensor, gamma: Tensor, blocks: Sequence[Tensor], whitened: Sequence[Tensor]
@@ -323,13 +314,12 @@ class _Sums:
             part = (x @ y.flatten(0, 1).T).view(len(x), len(index), -1)
             moments.index_add_(1, index, part.double())
 
-    def expectation(
-        self, parameters: Parameters, maps: Sequence[Tensor], points: Points, least: Tensor
-    ) -> Expectation:
+    def expectation(self, least: Tensor) -> Expectation:
         """Add up the sums of all processes."""
+        points, rounded = self.points, [block_map.double() for block_map in self.maps]
         mass, total, *sums = points.processes.sum(self.mass, self.total, *self.moments)
-        rounded, bound = [block_map.double() for block_map in maps], float(total) / points.total
-        return Expectation(parameters, rounded, mass, sums, bound, least)
+        bound = float(total) / points.total
+        return Expectation(self.parameters, rounded, mass, sums, bound, least)
 
 
 def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
@@ -445,11 +435,10 @@ def restart_components(
 
 def _worst(parameters: Parameters, points: Points, count: int) -> Tensor:
     """Find the points of lowest density (count, sum D_j), worst first."""
-    maps, peaks = whiten(parameters)
-    maps, peaks = [block_map.to(points.dtype) for block_map in maps], peaks.to(points.dtype)
-    worst = peaks.new_zeros(0, 1 + len(points.values))
+    whole = _Pass(parameters, points)
+    worst = whole.maps[0].new_zeros(0, 1 + len(points.values))
     for chunk, _ in points:
-        joint, _ = log_joint(points.blocks(chunk), maps, peaks, points.group_size)
+        joint, _ = whole.log_joint(points.blocks(chunk), slice(None), points.group_size)
         rows = torch.cat((joint.logsumexp(0)[None], chunk[points.values])).T
         worst = torch.cat((worst, rows))
         worst = worst[worst[:, 0].argsort(stable=True)[:count]]

@@ -10,13 +10,7 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.mixture.expectation_maximization import (
-    CovarianceFamily,
-    Labeller,
-    Parameters,
-    labelled_step,
-    m_step,
-)
+from tpgmm_torch.mixture import expectation_maximization as em
 from tpgmm_torch.mixture.points import Points
 
 
@@ -25,9 +19,9 @@ def draw_starts(
     n_starts: int,
     n_components: int,
     points: Points,
-    family: CovarianceFamily,
+    family: em.CovarianceFamily,
     rng: RandomState,
-) -> list[Parameters]:
+) -> list[em.Parameters]:
     """Draw starts: the Gaussians of the points that each component was given.
 
     Parameters
@@ -72,13 +66,13 @@ def draw_starts(
     else:
         found = [torch.from_numpy(centers()) for _ in range(n_starts)]
         labellers = [nearest(start_centers.to(points.shift)) for start_centers in found]
-    steps = (labelled_step(points, labeller, n_components) for labeller in labellers)
-    return [m_step(step, family, floor=False) for step in steps]
+    steps = (em.labelled_step(points, labeller, n_components) for labeller in labellers)
+    return [em.m_step(step, family, floor=False) for step in steps]
 
 
 def _bins_along_time(
     n_starts: int, n_bins: int, points: Points, rng: RandomState
-) -> list[Labeller]:
+) -> list[em.Labeller]:
     """Make equal bins, and bins of random sizes from the second start on."""
     # groups stay together, unless they are too few
     group_size = points.group_size if points.total // points.group_size >= n_bins else 1
@@ -109,7 +103,7 @@ def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> lis
     return (1 + rng.multinomial(n_points - n_bins, shares)).tolist()
 
 
-def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int) -> Labeller:
+def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int) -> em.Labeller:
     """Bin along time, with quantiles of a sample of the points as limits.
 
     They hold points in the given proportions: exactly, if the sample is all points. Points of
@@ -137,7 +131,7 @@ def time_bins(times: Tensor, numbers: Tensor, sizes: list[int], group_size: int)
     return labels
 
 
-def nearest(centers: Tensor) -> Labeller:
+def nearest(centers: Tensor) -> em.Labeller:
     """Label points by the nearest of some centers (K, sum D_j)."""
     # differences, not norms and products: a center is nearest to itself, rounding or not
     mode = "donot_use_mm_for_euclid_dist"

@@ -18,21 +18,15 @@ WINDOW, FEWEST = 0.25, 9
 DEMONSTRATIONS = 0.9
 
 
-def demonstrated_peaks(
-    demonstrations: Sequence[Demonstration], joint_names: Sequence[str]
-) -> tuple[Tensor, Tensor]:
-    """Compute peaks of acceleration and jerk of each joint.
+def typical_peaks(peaks: Sequence[Array]) -> tuple[Tensor, Tensor]:
+    """Compute the acceleration and jerk of each joint that few of the demonstrations exceed.
 
-    Second and third derivatives of recorded positions are mostly noise. They are taken from
-    cubic polynomials in windows of 0.25 s (Savitzky and Golay, 1964); a tenth of the
-    demonstrations may be outliers.
+    A tenth of the demonstrations may be outliers.
 
     Parameters
     ----------
-    demonstrations : sequence of Demonstration
-        Of the joints named.
-    joint_names : sequence of str
-        The joints, in their order.
+    peaks : sequence of array of shape (2, n_joints)
+        :func:`joint_peaks` of each demonstration.
 
     Returns
     -------
@@ -44,27 +38,20 @@ def demonstrated_peaks(
     --------
     >>> time = np.linspace(0, 3, 301)
     >>> swing = Demonstration(time, np.sin(2 * time)[:, None], joint_names=["a"])
-    >>> acceleration, jerk = demonstrated_peaks([swing], ["a"])
+    >>> acceleration, jerk = typical_peaks([joint_peaks(swing)])
     >>> round(float(acceleration), 1), round(float(jerk), 1)
     (4.0, 8.0)
-    """
-    return typical_peaks([joint_peaks(one.reorder(joint_names)) for one in demonstrations])
-
-
-def typical_peaks(peaks: Sequence[Array]) -> tuple[Tensor, Tensor]:
-    """Compute the acceleration and jerk that few of the demonstrations exceed.
-
-    Parameters
-    ----------
-    peaks : sequence of array of shape (2, n_joints)
-        :func:`joint_peaks` of each demonstration.
     """
     acceleration, jerk = np.quantile(np.stack(peaks), DEMONSTRATIONS, axis=0)
     return torch.from_numpy(acceleration), torch.from_numpy(jerk)
 
 
 def joint_peaks(demonstration: Demonstration) -> Array:
-    """Compute peaks (2, n_joints) of acceleration and jerk of one ``demonstration``."""
+    """Compute peaks (2, n_joints) of acceleration and jerk of one ``demonstration``.
+
+    Second and third derivatives of recorded positions are mostly noise. They are taken from
+    cubic polynomials in windows of 0.25 s (Savitzky and Golay, 1964).
+    """
     time, joints = as_array(demonstration.time), as_array(demonstration.joints)
     if len(time) < FEWEST:
         return np.zeros((2, joints.shape[1]))

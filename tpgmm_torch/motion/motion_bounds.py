@@ -96,7 +96,7 @@ class MotionBounds:
             Whose limits hold, or a skill, whose peaks count too.
         demonstrated : tuple of two Tensor of shape (n_joints,), optional
             Peaks of acceleration and jerk, of
-            :func:`~tpgmm_torch.motion.demonstrated_peaks.demonstrated_peaks`.
+            :func:`~tpgmm_torch.motion.demonstrated_peaks.typical_peaks`.
         **given : float, array-like of shape (n_joints,) or mapping of str to float
             ``lower``, ``upper``, ``velocity``, ``acceleration``, ``jerk``: for all joints, for
             each, or for some by name. They may be tighter than the robot's own, not wider.

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -83,11 +83,11 @@ class Operator(ABC):
         """Count the local coordinates, D."""
 
     @abstractmethod
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """Compute ``J``, ``M``, ``c`` at the state q_{t-1}; frames broadcast with it."""
 
     @abstractmethod
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """Compute the local coordinates X_t of a state, shape (..., D)."""
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
@@ -155,7 +155,7 @@ class Operator(ABC):
         """True if ``J`` has full column rank, so that this operator alone fixes every joint."""
         return False
 
-    def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def linear(self, state: RobotState, frames: Frames) -> Tensor:
         """``A_t = J^+ M`` of Table I, shape (..., n_joints, D)."""
         at = self.linearize(state, frames)
         _, linear = at.dense()
@@ -164,7 +164,7 @@ class Operator(ABC):
         batch = gaussians.common_shape(state.joints.shape[:-1], linear.shape[:-2])
         return linear.expand(*batch, *linear.shape[-2:])
 
-    def offset(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def offset(self, state: RobotState, frames: Frames) -> Tensor:
         """``b_t = J^+ c + q_{t-1}`` of Table I, shape (..., n_joints)."""
         at = self.linearize(state, frames)
         if at.jacobian is None:
@@ -173,11 +173,7 @@ class Operator(ABC):
         return (inverse @ at.displacement[..., None])[..., 0] + state.joints
 
     def along(
-        self,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        kinematics: Kinematics,
+        self, time: Tensor, state: RobotState, frames: Frames, kinematics: Kinematics
     ) -> Tensor:
         """Local coordinates (T, D) of the states of a motion, its quaternions continuous.
 

@@ -1,6 +1,6 @@
 """Configuration-space constraints: the first row of Table I."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -102,7 +102,7 @@ class Canonical(Operator):
             raise DataError("Canonical() has as many coordinates as the robot has joints")
         return len(self.columns(kinematics.joint_names))
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """``q - q_{t-1} = mu - q_{t-1}``, or those of its rows that are named."""
         joints = self.coordinates(state, frames)
         if self.joints is None:
@@ -112,7 +112,7 @@ class Canonical(Operator):
         rows = identity[list(self.columns(state.joint_names))]
         return Linearization(rows.expand(*joints.shape, n), None, -joints)
 
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """``q_t``."""
         if self.joints is None:
             return state.joints

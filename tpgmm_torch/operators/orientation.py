@@ -19,7 +19,6 @@ a position in tangent space, whose Jacobian is exact, not only where little is l
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -30,7 +29,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.constraints import Interval
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Linearization
 from tpgmm_torch.operators.pose import PoseOperator
@@ -117,9 +116,7 @@ class _Orientation(PoseOperator):
             rows = torch.tensor(self.path, dtype=torch.float64)
         return rows[:, 0].contiguous(), rows[:, 1:]
 
-    def _orientations(
-        self, state: RobotState, frames: Mapping[str, Frame]
-    ) -> tuple[Tensor, Tensor]:
+    def _orientations(self, state: RobotState, frames: Frames) -> tuple[Tensor, Tensor]:
         """``eps`` of the link, and what its coordinates refer to: ``eps_f``, ``eps_f b_t``."""
         body, reference = self.poses(state, frames)
         eps = body.orientation
@@ -135,7 +132,7 @@ class _Orientation(PoseOperator):
             )
         return eps, origin
 
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """``H+(conj eps_t^(j)) eps_t``; in tangent space ``log(conj(eps_t^(j) b_t) eps_t)``."""
         eps, origin = self._orientations(state, frames)
         seen = quaternions.product(quaternions.conjugate(origin), eps)
@@ -146,10 +143,11 @@ class _Orientation(PoseOperator):
 
         Where a link's quaternion is part of the joint vector nothing has to be linearised.
         """
-        place = not self.links()[1:] and self.moving_reference(state) is None
-        return not self._tangent and not (place and state.quaternion_columns(self.link))
+        if self._tangent or state.quaternion_columns(self.link) is None:
+            return not self._tangent
+        return bool(self.links()[1:]) or self.moving_reference(state) is not None
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """See :meth:`PoseOperator.linearize`; exact in tangent space and for tracked poses.
 
         Of tracked poses, whose quaternion is part of the joint vector, it is

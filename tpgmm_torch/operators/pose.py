@@ -9,7 +9,7 @@ one selection of rows their Jacobians: a control tick costs per operation, not p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.operators.base import Linearization, Operator
@@ -80,7 +80,7 @@ class PoseOperator(Operator):
         """Check that :func:`linearize_poses` serves."""
         return True
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """Return the row of eq. (6) for a position, of eq. (11) for an orientation.
 
         ``J (q - q_{t-1}) = R mu + p - x_{t-1}``, and
@@ -91,9 +91,7 @@ class PoseOperator(Operator):
         """
         return linearize_poses((self,), state, frames)
 
-    def poses(
-        self, state: RobotState, frames: Mapping[str, Frame]
-    ) -> tuple[Frame, Frame | None]:
+    def poses(self, state: RobotState, frames: Frames) -> tuple[Frame, Frame | None]:
         """Return the poses of what is seen and of what it is seen from, None for the base."""
         body = (
             state.pose(self.link)
@@ -106,7 +104,7 @@ class PoseOperator(Operator):
         return body, state.pose(moving) if moving else _place(self._frame, state, frames)
 
 
-def _place(name: str, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
+def _place(name: str, state: RobotState, frames: Frames) -> Frame:
     if name not in frames:
         known = [*frames, *state.links]
         raise UnknownNameError("frame", name, "the situation or the robot's links", known)
@@ -123,7 +121,7 @@ class _Term(NamedTuple):
 
 
 def linearize_poses(
-    operators: Iterable[PoseOperator], state: RobotState, frames: Mapping[str, Frame]
+    operators: Iterable[PoseOperator], state: RobotState, frames: Frames
 ) -> Linearization:
     """``J``, ``M``, ``c`` and the present quaternions of operators that are stacked.
 
@@ -135,17 +133,20 @@ def linearize_poses(
     """
     terms, like = tuple(operator.term for operator in operators), state.joints
     at = _constants(terms, state.links, len(state.carriers), like.dtype, like.device)
-    places = [*(_place(name, state, frames) for name in at.places), at.base]
+    places = [*(_place(name, state, frames) for name in at.places), *at.base]
     batch = common_shape(state.positions.shape[:-2], *(place.batch_shape for place in places))
     positions, orientations = _all_poses(state, places, batch)
     way = positions.index_select(-2, at.seen_from) - positions.index_select(-2, at.seen)
     way = way * at.is_position
     first = orientations.index_select(-2, at.first).unsqueeze(-1)
     pairs = first * orientations.index_select(-2, at.seen_from).unsqueeze(-2)
-    matrices = _product(pairs.flatten(-3), at.matrix).unflatten(-1, at.shape)
-    # the rows of each link, linear and angular, in threes, and three of zeros
-    threes = state.jacobians.unflatten(-2, (2, 3)).flatten(-4, -3)
-    threes = torch.cat((threes, torch.zeros_like(threes[..., :1, :, :])), -3)
+    matrices = _product(pairs.flatten(-3), at.matrix)
+    matrices = matrices.view(*matrices.shape[:-1], *at.shape)
+    # the rows of each link, linear and angular, in threes, and three of zeros if some need them
+    whole = state.jacobians.shape
+    threes = state.jacobians.reshape(*whole[:-3], 2 * len(state.links), 3, whole[-1])
+    if at.is_still:
+        threes = torch.cat((threes, torch.zeros_like(threes[..., :1, :, :])), -3)
     jacobian = threes.index_select(-3, at.rows)
     if at.is_moving:  # what it is seen from moves, and carries the points along
         angular = threes.index_select(-3, at.angular_rows).expand(*batch, -1, -1, -1)
@@ -180,7 +181,7 @@ class _Constants:
         def pose(name: str | None, moving: tuple[str, ...]) -> int:
             if name in moving:
                 return moving.index(name)
-            return len(links) + [*self.places, None].index(name)
+            return len(links) + (*self.places, None).index(name)
 
         def index(values: Iterable[int]) -> Tensor:
             return torch.tensor([*values], device=options["device"])
@@ -188,9 +189,11 @@ class _Constants:
         seen, seen_from = ([pose(*one) for one in group] for group in (bodies, references))
         self.bodies = list(zip(seen, seen_from, strict=True))
         self.is_moving = min(seen_from) < len(links)
+        self.is_still = any((self.is_moving, max(seen) >= len(links)))
         self.matrix, self.shape = _bilinear(terms, **options)
         unit = quaternions.identity(**options)
-        self.base = Frame.from_checked(torch.zeros_like(unit[:3]), unit)
+        base = Frame.from_checked(torch.zeros_like(unit[:3]), unit)
+        self.base = [base] * (None in dict(references))  # if one refers to it
         self.seen, self.seen_from = index(seen), index(seen_from)
         angular = index(term.gain is not None for term in terms).long()
         self.first = torch.where(angular > 0, self.seen, self.seen_from)

@@ -1,11 +1,10 @@
 """Position constraints in task space: section III-A, eqs (3) to (6)."""
 
-from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
 
 from torch import Tensor
 
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.operators.pose import PoseOperator
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -27,7 +26,7 @@ class _Position(PoseOperator):
         """Metres."""
         return ("m",) * 3
 
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """``R_t^T (x_t - p_t)``; in the base frame ``x_t``."""
         body, reference = self.poses(state, frames)
         point = body.position

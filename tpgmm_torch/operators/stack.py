@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Linearization, Operator, leaves
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
@@ -73,7 +73,7 @@ class Stack(Operator):
         """Return the sum of the dimensions."""
         return sum(operator.dimension(kinematics) for operator in self.operators)
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """Jacobians and displacements stacked, matrices on the diagonal."""
         parts: list[Linearization] = []
         for together, group in groupby(self.leaves, lambda leaf: _is_bilinear(leaf, state)):
@@ -83,7 +83,7 @@ class Stack(Operator):
                 parts += [operator.linearize(state, frames) for operator in group]
         return parts[0] if len(parts) == 1 else _stack_rows(parts, state.joints)
 
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """Return the coordinates side by side."""
         parts = [operator.coordinates(state, frames) for operator in self.operators]
         return _join(parts, gaussians.common_shape(*(part.shape[:-1] for part in parts)), 1)

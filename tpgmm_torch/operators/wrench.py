@@ -8,14 +8,14 @@ count along axes on which the force does no work, and only as far as there is co
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import KW_ONLY, dataclass
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -88,14 +88,14 @@ class Wrench(Operator):
         """Return a force for each axis, and the contact."""
         return len(self._axes) + 1
 
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+    def linearize(self, state: RobotState, frames: Frames) -> Linearization:
         """No rows: joints that have moved do not say which force there is."""
         empty, batch = state.joints, state.joints.shape[:-1]
         jacobian = empty.new_zeros(*batch, 0, empty.shape[-1])
         matrix = empty.new_zeros(*batch, 0, self.dimension(None))
         return Linearization(jacobian, matrix, empty.new_zeros(*batch, 0))
 
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+    def coordinates(self, state: RobotState, frames: Frames) -> Tensor:
         """``e^T R^T f`` for each axis ``e``, and 1 where ``|f|`` reaches ``contact``.
 
         Raises
@@ -111,7 +111,7 @@ class Wrench(Operator):
         touches = (force.norm(dim=-1, keepdim=True) >= self.contact).to(local)
         return torch.cat((local, touches.expand(*local.shape[:-1], 1)), -1)
 
-    def pose(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Frame:
+    def pose(self, state: RobotState | None, frames: Frames) -> Frame:
         """Return the pose of the frame; only that of a link needs the state."""
         if state is not None and self.frame in state.links:
             return state.pose(self.frame)
@@ -120,14 +120,12 @@ class Wrench(Operator):
             raise UnknownNameError("frame", self.frame, "the situation or the robot", known)
         return frames[self.frame]
 
-    def directions(self, state: RobotState | None, frames: Mapping[str, Frame]) -> Tensor:
+    def directions(self, state: RobotState | None, frames: Frames) -> Tensor:
         """Return the axes (..., n_axes, 3) in the base frame."""
         rotation = quaternions.to_matrix(self.pose(state, frames).orientation)
         return rotation.mT[..., list(self._axes), :]
 
-    def components(
-        self, vector: Tensor, state: RobotState | None, frames: Mapping[str, Frame]
-    ) -> Tensor:
+    def components(self, vector: Tensor, state: RobotState | None, frames: Frames) -> Tensor:
         """Components (..., n_axes) along the axes, of a vector (..., 3) in the base frame."""
         return (self.directions(state, frames) @ vector.unsqueeze(-1)).squeeze(-1)
 

@@ -149,12 +149,8 @@ class Conditionals(_OfComponents):
     def marginal(self, coordinates: Tensor) -> Conditionals:
         """Select some of the coordinates, by their indices."""
         covariance = self.covariance[:, coordinates][:, :, coordinates]
-        return replace(
-            self,
-            mean=self.mean[:, coordinates],
-            gain=self.gain[:, coordinates],
-            covariance=covariance,
-        )
+        mean, gain = self.mean[:, coordinates], self.gain[:, coordinates]
+        return replace(self, mean=mean, gain=gain, covariance=covariance)
 
     def recenter(self, time_mean: Tensor) -> Tensor:
         """Conditional means at a time of each component's own: shapes (K,) and (K, D)."""

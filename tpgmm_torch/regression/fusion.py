@@ -14,14 +14,14 @@ there are joints, no pseudo-inverse and no epsilon.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
 from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.operators.stack import POSE_OPERATORS
@@ -133,11 +133,7 @@ class KalmanUpdate:
         return all(type(leaf) in POSE_OPERATORS for leaf in leaves(tasks))
 
     def __call__(
-        self,
-        conditionals: Conditionals,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, conditionals: Conditionals, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor]:
         """Fused estimates of the joints by A components, in terms of the step ``q - q_{t-1}``.
 
@@ -171,7 +167,7 @@ class KalmanUpdate:
         if batch:
             time = time.expand(batch) if time.ndim else time.view(ones)
         mean, covariance = conditionals.at(time).movedim(-2, 0), conditionals.covariance
-        shape, width = (len(mean), *batch, -1, -1), mean.shape[-1] - n
+        shape, width = (mean.shape[0], *batch, -1, -1), mean.shape[-1] - n
         matrix = at.matrix
         if self._starts:
             present = at.present
@@ -182,9 +178,9 @@ class KalmanUpdate:
             signs = quaternions.hemisphere_signs(local, present, self._starts)
             matrix = matrix * signs.unsqueeze(-2)
         # tasks and joints are one vector z = (x, q - q_{t-1}), with r = [M, -J] z + c
-        mean = mean - torch.nn.functional.pad(state.joints, (width, 0))
-        jacobian = at.jacobian.contiguous()  # many robots' may be stored number by number
-        rows = torch.cat((matrix.expand(shape), -jacobian.expand(shape)), -1)
+        mean = mean - torch.constant_pad_nd(state.joints, (width, 0))
+        jacobian = -at.jacobian.contiguous()  # many robots' may be stored number by number
+        rows = torch.cat((matrix.expand(shape), jacobian.expand(shape)), -1)
         residual = rows @ mean.unsqueeze(-1) + at.displacement.unsqueeze(-1)
         cross = (rows.flatten(1, -2) @ covariance).view_as(rows)
         right = torch.cat((cross.narrow(-1, width, n), residual), -1)
@@ -194,10 +190,10 @@ class KalmanUpdate:
         white = gaussians.whiten(square, right, "the covariance of the tasks")
         update = white.narrow(-1, 0, n).mT @ white
         steps = mean.narrow(-1, width, n) - update[..., n]
-        prior = covariance.narrow(1, width, n).narrow(2, width, n).view(-1, *ones, n, n)
-        covariances = prior - update.narrow(-1, 0, n)
+        prior = covariance.narrow(1, width, n).narrow(2, width, n)
         if not batch:
-            return steps, covariances
+            return steps, prior - update.narrow(-1, 0, n)
+        covariances = prior.view(-1, *ones, n, n) - update.narrow(-1, 0, n)
         return steps.movedim(0, -2), covariances.movedim(0, -3)
 
 

@@ -20,7 +20,7 @@ sequence of postures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.operators.stack import POSE_OPERATORS
@@ -95,7 +95,7 @@ class PostureSearch:
         self,
         time: Tensor,
         reference: Tensor,
-        frames: Mapping[str, Frame],
+        frames: Frames,
         estimate: Estimate,
         bounds: tuple[Tensor, Tensor],
         asked: Tensor,
@@ -158,7 +158,7 @@ class PostureSearch:
         self,
         time: Tensor,
         reference: Tensor,
-        frames: Mapping[str, Frame],
+        frames: Frames,
         estimate: Estimate,
         bounds: tuple[Tensor, Tensor],
         rows: Tensor,
@@ -180,14 +180,10 @@ class PostureSearch:
             everyone[of_all] = joints
             return state_at(everyone)[of_all]
 
-        cost = PostureCost(
-            self,
-            estimate.activation.expand(*batch, -1)[where],
-            time.expand(batch)[where] if time.ndim else time,
-            begun,
-            {name: frame.expand(batch)[where] for name, frame in frames.items()},
-            state,
-        )
+        weights = estimate.activation.expand(*batch, -1)[where]
+        now = time.expand(batch)[where] if time.ndim else time
+        here = {name: frame.expand(batch)[where] for name, frame in frames.items()}
+        cost = PostureCost(self, weights, now, begun, here, state)
         # elsewhere or, within reach, a step from where the robot stands
         look, begins = age // LOOK, (age < LOOK) | (age % LOOK == 0)
         if bool(begins.any()):
@@ -318,7 +314,7 @@ class PostureCost:
         weights: Tensor,
         time: Tensor,
         centre: Tensor,
-        frames: Mapping[str, Frame],
+        frames: Frames,
         state_at: Callable[[Tensor], RobotState],
     ) -> None:
         weights = torch.where(weights > NEGLIGIBLE, weights, 0.0)
@@ -409,7 +405,7 @@ class Residual:
         return cls(operator, starts, kept, turning)
 
     def __call__(
-        self, mean: Tensor, state: RobotState, frames: Mapping[str, Frame]
+        self, mean: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor | None, Tensor, Tensor | None, Tensor | None]:
         """``M`` with the mean's signs, ``r``, minus its derivative (None: identity), noise."""
         at = self.operator.linearize(state, frames)

@@ -9,7 +9,7 @@ mix the components.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -21,7 +21,7 @@ from torch import Tensor
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.command_gaps import CommandGaps
@@ -80,12 +80,9 @@ class Components:
     def select(self, index: Sequence[int]) -> Components:
         """Some of them, by their place among them."""
         places = torch.tensor(index, device=self.index.device)
-        return Components(
-            self.index[places],
-            self.places[places],
-            self.marginals.select(places),
-            tuple(one.select(places) for one in self.conditionals),
-        )
+        conditionals = tuple(one.select(places) for one in self.conditionals)
+        marginals = self.marginals.select(places)
+        return Components(self.index[places], self.places[places], marginals, conditionals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +167,7 @@ class Regression:
         self,
         time: Tensor,
         state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
+        frames: Frames,
         bounds: tuple[Tensor, Tensor] | None = None,
         *,
         candidates: bool = False,
@@ -197,11 +194,7 @@ class Regression:
         return found
 
     def fuse(
-        self,
-        components: Components,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, components: Components, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Eqs (1), (2) and regression: the mixture of some components, fused, given time.
 
@@ -217,12 +210,12 @@ class Regression:
             steps, covariances = self._update(stacked, time, state, frames)
             log_h = self._log_activation(components, time)
         else:
-            precision, vector, square = self._sum(components, time, state, frames)
-            steps, covariances = gaussians.from_information(precision, vector[..., 0])
+            sums = self._sum(components, time, state, frames)
+            steps, covariances = gaussians.from_information(sums[0], sums[1][..., 0])
             if self.fusion.activation == "time":
                 log_h = self._log_activation(components, time)
             else:
-                log_h = self._product_activation(components, time, precision, vector, square)
+                log_h = self._product_activation(components, time, sums)
         weights = torch.softmax(log_h, -1)
         step, covariance = gaussians.moment_match(weights, steps, covariances)
         return state.joints + step, covariance, weights
@@ -238,31 +231,24 @@ class Regression:
 
     def expected_forces(self, time: Tensor) -> tuple[ExpectedForce, ...]:
         """Expect a force for each :class:`Wrench`; see :meth:`Skill.expected_forces`."""
-        first, found = len(of_joints(self.operators)), []
+        first, found = len(self._of_joints[0]), []
         pairs = zip(self.operators[first:], self.conditionals[first:], strict=True)
         for operator, one in pairs:
             assert isinstance(operator, Wrench)
-            mean, covariance = gaussians.moment_match(
-                self.weights_at(time), one.at(time), one.covariance
-            )
+            parts = self.weights_at(time), one.at(time), one.covariance
+            mean, covariance = gaussians.moment_match(*parts)
             share = mean[..., -1].clamp(0.0, 1.0)
-            found.append(
-                ExpectedForce(operator, mean[..., :-1], covariance[..., :-1, :-1], share)
-            )
+            moments = mean[..., :-1], covariance[..., :-1, :-1]
+            found.append(ExpectedForce(operator, *moments, share))
         return tuple(found)
 
     def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
+        self, times: Tensor, state: RobotState, frames: Frames, window: slice = slice(None)
     ) -> Tensor:
         """Log-density of observed robots at times; see :meth:`Skill.log_likelihood`."""
         key = times.numpy(force=True).tobytes()
         if key not in self._likelihoods:
-            own = of_joints(self.operators)
-            parts = self.kinematics, own, self.conditionals[: len(own)], self.marginals
+            parts = self.kinematics, *self._of_joints, self.marginals
             with torch.inference_mode(False):
                 self._likelihoods[key] = TimeLikelihood(*parts, times)
         with torch.inference_mode():
@@ -310,7 +296,7 @@ class Regression:
         seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
         return Stack(*seen), one.marginal(columns)
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
+    def start(self, joints: Tensor, frames: Frames) -> Regression:
         """Return the same for all robots; see :meth:`Skill.start`."""
         return self
 
@@ -328,11 +314,9 @@ class Regression:
 
     @cached_property
     def _search(self) -> PostureSearch:
-        own = of_joints(self.operators)
-        terms = [Residual.of(operator, self.kinematics) for operator in own]
-        return PostureSearch(
-            self.kinematics, terms, self.scaled_conditionals, self.free_precision
-        )
+        kinematics, (own, _) = self.kinematics, self._of_joints
+        terms = [Residual.of(operator, kinematics) for operator in own]
+        return PostureSearch(kinematics, terms, self.scaled_conditionals, self.free_precision)
 
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
@@ -357,7 +341,7 @@ class Regression:
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
-    def surprise(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+    def surprise(self, time: Tensor, joints: Tensor, frames: Frames) -> Tensor:
         """Compute how much less likely local coordinates are than those expected [nats].
 
         Parameters
@@ -373,7 +357,7 @@ class Regression:
         state, batch = self.kinematics.state(joints), joints.shape[:-1]
         times = time.expand(batch).flatten()
         local, expected = [], []
-        for j, operator in enumerate(of_joints(self.operators)):
+        for j, operator in enumerate(self._of_joints[0]):
             rows = operator.at(time).coordinates(state, frames)
             rows = rows.expand(*batch, -1).reshape(len(times), -1)
             wanted = self.expect(j, times)
@@ -384,7 +368,7 @@ class Regression:
         return (most - self.log_density(times, local, self.n_samples)).reshape(batch)
 
     def candidates(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+        self, time: Tensor, state: RobotState, frames: Frames, estimate: Estimate
     ) -> tuple[Candidate, ...]:
         """Eq. (1) for each operator of joints, mixed over the components, and its share.
 
@@ -392,8 +376,7 @@ class Regression:
         """
         index = self._components_at(time).index
         weights = estimate.activation[..., index]
-        own = self.conditionals[: len(of_joints(self.operators))]
-        conditionals = [one.select(index) for one in own]
+        conditionals = [one.select(index) for one in self._of_joints[1]]
         means, covariances = [], []
         for at, mean, _, covariance in self._local(conditionals, time, state, frames):
             # mixing commutes with the affine map, and is less work before it
@@ -411,6 +394,12 @@ class Regression:
         return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
+    def _of_joints(self) -> tuple[tuple[Operator, ...], Sequence[Conditionals]]:
+        """The operators that have rows in joint space, and their conditionals."""
+        operators = of_joints(self.operators)
+        return operators, self.conditionals[: len(operators)]
+
+    @cached_property
     def scaled_conditionals(self) -> tuple[Conditionals, ...]:
         """The conditionals as they are fused: with covariances that say who gives way.
 
@@ -423,7 +412,7 @@ class Regression:
         where the joints are then depends on the situation, and few of them show too little of
         it: where a new one is turned otherwise, joints would hold the hands back.
         """
-        operators = of_joints(self.operators)
+        operators, conditionals = self._of_joints
         priorities = self.fusion.priorities or [0] * len(operators)
         levels = sorted(set(priorities))
         alone = all(leaf.is_posture for leaf in leaves(operators))
@@ -431,8 +420,7 @@ class Regression:
         fused = []
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            local = self.conditionals[: len(operators)]
-            parts = zip(local, operators, priorities, strict=True)
+            parts = zip(conditionals, operators, priorities, strict=True)
             for one, operator, priority in parts:
                 members = leaves([operator])
                 widths = [wider if leaf.is_posture else 1.0 for leaf in members]
@@ -446,8 +434,7 @@ class Regression:
     @cached_property
     def _update(self) -> KalmanUpdate | None:
         """The update of a prior over the joints, where that is what is asked for."""
-        information = isinstance(self.fusion, InformationFusion)
-        operators = of_joints(self.operators)
+        operators, information = self._of_joints[0], isinstance(self.fusion, InformationFusion)
         if not information or not KalmanUpdate.serves(operators, self.kinematics):
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
@@ -457,16 +444,10 @@ class Regression:
     @cached_property
     def free_precision(self) -> Tensor:
         """Precision (n_joints,) of the prior around q_{t-1}: 0 where operators determine it."""
-        own = of_joints(self.operators)
-        if any(one.determines_joints for one in own):
+        if any(one.determines_joints for one in self._of_joints[0]):
             return torch.zeros_like(self.kinematics.lower)
-        return prior_widths(
-            self.fusion.prior_std,
-            self.kinematics,
-            own,
-            self.conditionals[: len(own)],
-            self.log_weights.exp(),
-        ).pow(-2)
+        stds, weights = self.fusion.prior_std, self.log_weights.exp()
+        return prior_widths(stds, self.kinematics, *self._of_joints, weights).pow(-2)
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -552,18 +533,14 @@ class Regression:
         return log_h
 
     def _product_activation(
-        self,
-        components: Components,
-        time: Tensor,
-        precision: Tensor,
-        vector: Tensor,
-        square: Tensor,
+        self, components: Components, time: Tensor, sums: tuple[Tensor, Tensor, Tensor]
     ) -> Tensor:
         """``log h_i(t)``, up to a constant, from the time marginal of the product (2).
 
         Integrating the joints out of the product leaves a quadratic in the time t + delta:
         the operators' time marginals plus how much they disagree about the joints.
         """
+        precision, vector, square = sums
         white = gaussians.whiten(precision, vector, "the precision of the product")
         disagreement = square - white.mT @ white
         slope, curvature = disagreement[..., 0, 1], disagreement[..., 1, 1]
@@ -576,18 +553,14 @@ class Regression:
         return state if isinstance(state, RobotState) else self.kinematics.state(state)
 
     def _estimate_together(
-        self, time: Tensor, state: Tensor | RobotState, frames: Mapping[str, Frame]
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
     ) -> Estimate:
         components = self._components_at(time)
         joints, covariance, weights = self.fuse(components, time, self._state(state), frames)
         return Estimate(joints, covariance, weights @ components.places)
 
     def _in_parts(
-        self,
-        batch: torch.Size,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
+        self, batch: torch.Size, time: Tensor, state: Tensor | RobotState, frames: Frames
     ) -> Estimate:
         """Estimate many robots part by part, those together that are at about the same time."""
         if isinstance(state, RobotState):
@@ -600,33 +573,30 @@ class Regression:
         parts = []
         for part in order.split(PART):
             here = {name: pose[part] for name, pose in poses.items()}
-            parts.append(
-                self._estimate_together(time[part] if time.ndim else time, state[part], here)
-            )
+            now = time[part] if time.ndim else time
+            parts.append(self._estimate_together(now, state[part], here))
         back = order.argsort()
 
         def whole(name: str) -> Tensor:
             return torch.cat([getattr(one, name) for one in parts])[back].unflatten(0, batch)
 
         activation = parts[0].activation  # one of all, where they are at one time
-        return Estimate(
-            whole("joints"),
-            whole("covariance"),
-            whole("activation") if activation.ndim > 1 else activation,
-        )
+        if activation.ndim > 1:
+            activation = whole("activation")
+        return Estimate(whole("joints"), whole("covariance"), activation)
 
     def _local(
         self,
         conditionals: Sequence[Conditionals],
         time: Tensor,
         state: RobotState,
-        frames: Mapping[str, Frame],
+        frames: Frames,
     ) -> Iterator[tuple[Linearization, Tensor, Tensor, Tensor]]:
         """Each operator here, and means, time derivatives and covariances of components.
 
         Quaternions are on the side of the present ones.
         """
-        for operator, one in zip(of_joints(self.operators), conditionals, strict=True):
+        for operator, one in zip(self._of_joints[0], conditionals, strict=True):
             mean, gain, covariance = one.at(time), one.gain, one.covariance
             operator = operator.at(time)
             starts = operator.quaternion_starts(self.kinematics)
@@ -638,11 +608,7 @@ class Regression:
             yield operator.linearize(state, frames), mean, gain, covariance
 
     def _sum(
-        self,
-        components: Components,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
+        self, components: Components, time: Tensor, state: RobotState, frames: Frames
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Sums of the operators' information, in terms of the step ``q - q_{t-1}``."""
         terms = []
@@ -655,9 +621,8 @@ class Regression:
             if isinstance(self.fusion, CovarianceFusion):
                 one = one.in_joint_space(self.fusion.epsilon)
             terms.append(gaussians.information(one.jacobian, one.targets, one.covariance))
-        precision, vector, square = (
-            sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True)
-        )
+        every = zip(*terms, strict=True)
+        precision, vector, square = (sum(parts[1:], start=parts[0]) for parts in every)
         if isinstance(self.fusion, InformationFusion):
             precision = precision + self.free_precision.diag()
         return precision, vector, square

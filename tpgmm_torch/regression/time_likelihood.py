@@ -11,7 +11,7 @@ three numbers of each component.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.operators.base import leaves
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
@@ -80,9 +80,7 @@ class TimeLikelihood:
             self._parts.append((operator, part))
             self._curvature = self._curvature + part.curvature
 
-    def __call__(
-        self, state: RobotState, frames: Mapping[str, Frame], window: slice = slice(None)
-    ) -> Array:
+    def __call__(self, state: RobotState, frames: Frames, window: slice = slice(None)) -> Array:
         """``log p(x | t)`` at the times of a window, (B, G), up to a constant of each robot.
 
         Parameters
@@ -156,7 +154,7 @@ class _Coordinates:
 
 
 def _local(
-    operator: Operator, starts: Sequence[int], state: RobotState, frames: Mapping[str, Frame]
+    operator: Operator, starts: Sequence[int], state: RobotState, frames: Frames
 ) -> Array:
     """Local coordinates (..., D); those of a stack of poses are faster read from its map."""
     if isinstance(operator, Stack):

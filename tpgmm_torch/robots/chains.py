@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import UrdfJoint, write_urdf
 
@@ -34,29 +34,32 @@ def chain_to_urdf(chain: Any) -> str:
     while frames:
         parent, frame = frames.pop()
         joint, pose = frame.joint, _matrix(frame.link.offset) @ _matrix(frame.joint.offset)
-        kind, axis = joint.joint_type, _unit(joint.axis)
+        kind, axis = joint.joint_type, as_array(joint.axis)
+        axis = axis / np.linalg.norm(axis)
         name = f"{frame.name}_mount" if kind == "fixed" else joint.name
         lower, upper = _ends(joint.limits)
         velocity = _ends(joint.velocity_limits)[1]
         if kind == "revolute" and math.isinf(upper):
             kind = "continuous"
         joints.append(
-            UrdfJoint(name, kind, parent, frame.name, pose, axis, lower, upper, velocity)
+            UrdfJoint(
+                name,
+                kind,
+                parent,
+                frame.name,
+                pose,
+                axis / np.linalg.norm(axis),
+                lower,
+                upper,
+                velocity,
+            )
         )
         frames += [(frame.name, child) for child in reversed(frame.children)]
     return write_urdf(root.name, "world", joints)
 
 
 def _matrix(offset: Any) -> Array:
-    if offset is None:
-        return np.eye(4)
-    matrix: Array = offset.get_matrix()[0].detach().cpu().double().numpy()
-    return matrix
-
-
-def _unit(axis: Any) -> Array:
-    vector: Array = axis.detach().cpu().double().numpy()
-    return vector / np.linalg.norm(vector)
+    return np.eye(4) if offset is None else as_array(offset.get_matrix()[0])
 
 
 def _ends(limits: Any) -> tuple[float, float]:

@@ -124,7 +124,7 @@ class TreeKinematics:
             local = torch.addcmul(local, sliding, moved)
         numbers = self._products(local.view(*local.shape[:-1], 4, 4)).flatten(1)
         numbers = numbers.index_select(1, self._wanted)
-        position, origin, axis, quaternion = numbers.split(self._sizes, 1)
+        position, origin, axis, quaternion = numbers.split_with_sizes(self._sizes, 1)
         position = position.view(-1, links, 3)
         quaternion = quaternion.view(-1, links, 4)
         quaternion = quaternion * quaternions.hemisphere_sign(quaternion.narrow(-1, 0, 1))
@@ -140,7 +140,7 @@ class TreeKinematics:
 
     def _products(self, local: Tensor) -> Tensor:
         """Multiply matrices (B, 2 N, 4, 4), each given in its carrier, along the tree."""
-        if len(local) <= FEW or torch.compiler.is_compiling():
+        if local.shape[0] <= FEW or torch.compiler.is_compiling():
             for ancestors in self._ancestors:
                 local = _product(local.index_select(1, ancestors), local)
             return local

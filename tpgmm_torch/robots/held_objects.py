@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.robots.kinematics import RobotState
 
@@ -15,7 +15,7 @@ from tpgmm_torch.robots.kinematics import RobotState
 def held_objects(
     state: RobotState,
     time: Tensor,
-    frames: Mapping[str, Frame],
+    frames: Frames,
     holds: Sequence[Hold],
     *,
     attached: bool = False,

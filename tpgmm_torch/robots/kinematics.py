@@ -25,6 +25,9 @@ from tpgmm_torch.gaussians import common_shape
 
 __all__ = ["JointSpace", "Kinematics", "RobotState"]
 
+#: The lowest and the highest joints (..., n_joints) allowed [rad or m]; None allows all.
+Bounds = tuple[Tensor, Tensor] | None
+
 
 def parse_dtype(dtype: Any) -> torch.dtype:
     """Parse the ``dtype`` of a robot, also a name, ``"float32"`` or ``"float64"``.

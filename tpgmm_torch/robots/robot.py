@@ -19,7 +19,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array, as_tensor
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
@@ -540,7 +540,7 @@ def _poses(given: Mapping[str, Any], names: Iterable[str]) -> dict[str, Frame]:
     return {name: _pose(name, given.get(name, [0, 0, 0])) for name in names}
 
 
-def _check_bases(places: Mapping[str, Frame]) -> None:
+def _check_bases(places: Frames) -> None:
     """Warn of bases that no robots have which work together."""
     at = torch.stack([place.position for place in places.values()])
     if (apart := float(torch.cdist(at, at).max())) > FARTHEST_BASES:
@@ -568,9 +568,7 @@ def _select_links(
     return config["base"], [places[link] for link in config["links"]]
 
 
-def _merge_urdfs(
-    robots: Mapping[str, Robot], roots: Mapping[str, Frame], fixed: Iterable[str]
-) -> str:
+def _merge_urdfs(robots: Mapping[str, Robot], roots: Frames, fixed: Iterable[str]) -> str:
     """Merge robots and fixed links, whose roots are somewhere in a world."""
     urdf = ElementTree.Element("robot", name=" and ".join(robots))
     urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 
@@ -126,7 +126,7 @@ class Poses(Described):
         return torch.cat((poses[..., :3], unit), dim=-1).flatten(-2)
 
     @classmethod
-    def joints(cls, poses: Mapping[str, Frame], orientation: bool = True) -> Tensor:
+    def joints(cls, poses: Frames, orientation: bool = True) -> Tensor:
         """Join recorded poses to joint vectors (T, n_joints), or (n_joints,).
 
         Parameters

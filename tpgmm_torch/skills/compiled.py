@@ -13,7 +13,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -24,14 +24,14 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.atomic import replacing
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.joint_limits import keep_within
 from tpgmm_torch.regression.regression import Components, Regression
-from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import Bounds, RobotState
 from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["compile_skill"]
@@ -148,8 +148,8 @@ class CompiledRegression(Regression):
         self,
         time: Tensor,
         state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
+        frames: Frames,
+        bounds: Bounds = None,
         *,
         candidates: bool = False,
     ) -> Estimate:
@@ -184,7 +184,7 @@ class CompiledRegression(Regression):
             return None
         return Estimate(mean, covariance, results[0][2] @ components.places)
 
-    def _serves(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> bool:
+    def _serves(self, time: Tensor, joints: Tensor, frames: Frames) -> bool:
         """Check that the graph serves: few components, no gradients, all frames."""
         differentiated = torch.is_grad_enabled() and joints.requires_grad
         if time.ndim or differentiated or joints.shape[-1:] != self.kinematics.lower.shape:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -129,7 +129,7 @@ class Holding:
     kinematics: Kinematics
     holds: tuple[Hold, ...]
     objects: tuple[str, ...]
-    frames: Mapping[str, Frame]
+    frames: Frames
     held: Mapping[str, Held] = field(default_factory=dict)
 
     @classmethod
@@ -138,7 +138,7 @@ class Holding:
         kinematics: Kinematics,
         objects: Sequence[str],
         holds: Sequence[Hold],
-        frames: Mapping[str, Frame],
+        frames: Frames,
     ) -> Self:
         """Before anything is held.
 
@@ -172,7 +172,7 @@ class Holding:
         self,
         time: float | Tensor,
         joints: Tensor,
-        frames: Mapping[str, Frame] | None = None,
+        frames: Frames | None = None,
         given: Mapping[str, str | None] | None = None,
         where: Tensor | None = None,
         dt: float | Tensor = 0.0,
@@ -278,7 +278,7 @@ class Holding:
         now = replace(before, given=before.given & ~where)
         return replace(self, held={**self.held, name: now})
 
-    def release(self, robots: Tensor, seen: Mapping[str, Frame]) -> Self:
+    def release(self, robots: Tensor, seen: Frames) -> Self:
         """Some robots hold nothing, and objects are where they are seen.
 
         From the next tick on the skill says what they hold.

@@ -5,7 +5,8 @@ Nothing is measured, and nothing bounds the references: a skill alone, and what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
@@ -67,9 +68,7 @@ def reproduce(
     return with_novelty(skill, known, done)
 
 
-def open_loop(
-    skill: Skill, start: Tensor, poses: Mapping[str, Frame], grid: Sequence[float]
-) -> list[Tick]:
+def open_loop(skill: Skill, start: Tensor, poses: Frames, grid: Sequence[float]) -> list[Tick]:
     """References at the times of a grid, from start postures (..., n_joints) on.
 
     Parameters
@@ -85,27 +84,29 @@ def open_loop(
     here = _poses_at(0, poses, moving)
     holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, here)
     skill, joints, last = skill.start(start, here), start, None
-    done, inferring = list[Tick](), torch.is_inference_mode_enabled()
-    for k, now in enumerate(grid):
-        if now == last:
-            done.append(done[-1])
-            continue
-        seen = _poses_at(k, poses, moving) if moving else None
-        time = start.new_tensor(now)
-        # what the first step does not record, none does; to ask so takes a third
-        with torch.inference_mode(inferring or (k > 0 and not done[0][0].requires_grad)):
+    done = list[Tick]()
+    with ExitStack() as stack:
+        for k, now in enumerate(grid):
+            if now == last:
+                done.append(done[-1])
+                continue
+            seen = _poses_at(k, poses, moving) if moving else None
+            time = start.new_tensor(now)
             holding = holding.advance(time, joints, seen)
             state: Any = joints
             if holding.carries:
                 state = holding.state(skill.kinematics.state(joints))
             found = skill.estimate(time, state, holding.frames)
             skill, joints = skill.advance(found), skill.kinematics.retract(found.joints)
-        done.append((joints, found, holding))
-        last = now
+            done.append((joints, found, holding))
+            last = now
+            if k == 0 and not joints.requires_grad:
+                # what the first step does not record, none does; to ask so takes a third
+                stack.enter_context(torch.inference_mode())
     return done
 
 
-def _poses_at(k: int, poses: Mapping[str, Frame], moving: set[str]) -> dict[str, Frame]:
+def _poses_at(k: int, poses: Frames, moving: set[str]) -> dict[str, Frame]:
     """Select the poses at an instant, where they move."""
     return {name: pose[k] if name in moving else pose for name, pose in poses.items()}
 
@@ -182,14 +183,6 @@ def _run_together(
     ]
 
 
-def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
-    """Frames of B situations, (B,) or, if they move, (T, B)."""
-    return {
-        name: Frame.stack([situation.frames[name] for situation in situations])
-        for name in situations[0].frames
-    }
-
-
 def _over_time(estimates: Sequence[Estimate], shape: Sequence[int]) -> Estimate:
     """Estimates (T, B, ...) of T ticks."""
     return Estimate(
@@ -199,11 +192,18 @@ def _over_time(estimates: Sequence[Estimate], shape: Sequence[int]) -> Estimate:
     )
 
 
+def _stack_frames(situations: Sequence[Situation]) -> dict[str, Frame]:
+    """Frames of B situations, (B,) or, if they move, (T, B)."""
+    return {
+        name: Frame.stack([situation.frames[name] for situation in situations])
+        for name in situations[0].frames
+    }
+
+
 def _row(candidates: Sequence[Candidate], row: int) -> tuple[Candidate, ...]:
     """Candidates of one robot of a batch."""
     return tuple(
-        Candidate(one.mean[:, row], one.covariance[:, row], one.share[:, row])
-        for one in candidates
+        Candidate(*(part[:, row] for part in vars(one).values())) for one in candidates
     )
 
 
@@ -211,7 +211,7 @@ def _candidates(
     skill: Skill,
     time: torch.Tensor,
     joints: torch.Tensor,
-    frames: Mapping[str, Frame],
+    frames: Frames,
     holdings: Sequence[Holding],
     whole: Estimate,
 ) -> list[Candidate]:
@@ -223,14 +223,13 @@ def _candidates(
     parts = []
     for now in _stretches(holdings, size):
         estimate = Estimate(whole.joints[now], whole.covariance[now], activation[now])
-        holding = _together(holdings[now], _at(frames, now), joints.shape[1:2])
+        here = {n: f[now] if len(f.batch_shape) == 2 else f for n, f in frames.items()}
+        holding = _together(holdings[now], here, joints.shape[1:2])
         state = holding.state(skill.kinematics.state(joints[now]))
         at = time[now].unsqueeze(-1)
         parts.append(skill.candidates(at, state, holding.frames, estimate))
-    return [
-        Candidate(*(torch.cat(field) for field in zip(*map(_fields, over_time), strict=True)))
-        for over_time in zip(*parts, strict=True)
-    ]
+    several = [[vars(one).values() for one in own] for own in zip(*parts, strict=True)]
+    return [Candidate(*map(torch.cat, zip(*fields, strict=True))) for fields in several]
 
 
 def _stretches(holdings: Sequence[Holding], size: int) -> Iterator[slice]:
@@ -243,9 +242,7 @@ def _stretches(holdings: Sequence[Holding], size: int) -> Iterator[slice]:
             start = k
 
 
-def _together(
-    holdings: Sequence[Holding], frames: Mapping[str, Frame], batch: Sequence[int]
-) -> Holding:
+def _together(holdings: Sequence[Holding], frames: Frames, batch: Sequence[int]) -> Holding:
     """Several instants (T, B) at which the robots hold the same things."""
     places = dict(frames)
     for name in holdings[0].held:
@@ -255,12 +252,3 @@ def _together(
             torch.stack([pose.orientation for pose in each]),
         )
     return replace(holdings[0], frames=places)
-
-
-def _at(frames: Mapping[str, Frame], now: slice) -> dict[str, Frame]:
-    """Frames of shape (B,) or, if they move, (T, B) at some instants."""
-    return {name: f[now] if len(f.batch_shape) == 2 else f for name, f in frames.items()}
-
-
-def _fields(candidate: Candidate) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    return candidate.mean, candidate.covariance, candidate.share

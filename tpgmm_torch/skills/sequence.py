@@ -84,14 +84,13 @@ class Sequence(CompositeSkill):
         parts = _are_parts(skills, self.fade or PARTS_FADE)
         untils = _of_each("until", self.until or None, count)
         retries = _of_each("retry", self.retry or 0, count)
-        for name, value in {
-            "skills": skills,
-            "names": names,
-            "fade": self.fade or (PARTS_FADE if parts else SKILLS_FADE),
-            "until": tuple(map(_conditions, skills, untils)),
-            "retry": tuple(_retry(names, *each) for each in enumerate(retries)),
-        }.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(
+            skills=skills,
+            names=names,
+            fade=self.fade or (PARTS_FADE if parts else SKILLS_FADE),
+            until=tuple(map(_conditions, skills, untils)),
+            retry=tuple(_retry(names, *each) for each in enumerate(retries)),
+        )
 
     def _checked_names(self) -> tuple[str, ...]:
         """Names of the skills, of which there is at least one; all settings are numbers."""

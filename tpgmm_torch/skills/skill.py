@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Protocol, Self
 
@@ -13,14 +13,14 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators.wrench import ExpectedForce
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.robots.kinematics import Bounds, Kinematics, RobotState
 from tpgmm_torch.skills.gate import Gate
 
 __all__ = ["Skill"]
@@ -111,11 +111,7 @@ class Skill(Protocol):
         return () if self.summary is None else (self.summary,)
 
     def estimate(
-        self,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames, bounds: Bounds = None
     ) -> Estimate:
         """Estimate the joints at a time, given the state q_{t-1} and the objects' poses.
 
@@ -138,7 +134,7 @@ class Skill(Protocol):
         ...
 
     def candidates(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
+        self, time: Tensor, state: RobotState, frames: Frames, estimate: Estimate
     ) -> tuple[Candidate, ...]:
         """Estimate the joints by each operator alone; none by default.
 
@@ -162,11 +158,7 @@ class Skill(Protocol):
         return ()
 
     def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
+        self, times: Tensor, state: RobotState, frames: Frames, window: slice = slice(None)
     ) -> Tensor:
         """Log-density of observed robots at each time, up to a constant of each robot.
 
@@ -207,7 +199,7 @@ class Skill(Protocol):
         """Search for the nearest posture where an estimate cannot be followed, or None."""
         return None
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
+    def start(self, joints: Tensor, frames: Frames) -> Skill:
         """Return the skill for robots that begin with these postures and objects.
 
         Parameters
@@ -352,7 +344,7 @@ class CompositeSkill(Skill):
         made: Self = replace(whole, skills=others)
         return made
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+    def start(self, joints: Tensor, frames: Frames) -> Self:
         """See :meth:`Skill.start`."""
         return self.with_skills(one.start(joints, frames) for one in self.skills)
 
@@ -361,11 +353,7 @@ class CompositeSkill(Skill):
         return self.with_skills(one.of_robots(robots) for one in self.skills)
 
     def estimate(
-        self,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames, bounds: Bounds = None
     ) -> Estimate:
         """See :meth:`Skill.estimate`; the activation is that of the skills."""
         shares, skills = self.shares(time.to(self.kinematics.lower)), list(self.skills)
@@ -402,11 +390,7 @@ class CompositeSkill(Skill):
         return tuple(found.values())
 
     def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
+        self, times: Tensor, state: RobotState, frames: Frames, window: slice = slice(None)
     ) -> Tensor:
         """See :meth:`Skill.log_likelihood`: of the skill with the largest share."""
         each = torch.stack(

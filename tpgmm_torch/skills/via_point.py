@@ -14,7 +14,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -85,14 +85,12 @@ class ViaPoint:
                 "a via-point has a finite time and no negative tolerance, got "
                 f"time={time}, tolerance={tolerance}"
             )
-        width = widths.tolist()
-        for name, given in {
-            "time": float(time),
-            "operator": operator,
-            "value": _read_value(operator, value),
-            "tolerance": tuple(width) if widths.ndim else width,
-        }.items():
-            object.__setattr__(self, name, given)
+        width: Any = widths.tolist()
+        found = _read_value(operator, value)
+        if isinstance(found, dict):  # one form of some joints: the operator names them
+            operator = Canonical(joints=tuple(found))
+        width = tuple(width) if widths.ndim else width
+        vars(self).update(time=float(time), operator=operator, value=found, tolerance=width)
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -126,21 +124,21 @@ class ViaPoint:
         return cls(time, match["what"].strip(), value, widths)
 
     def __str__(self) -> str:
+        what, value = format_operator(self.operator), ",".join(map(repr, self.value))
         if isinstance(self.value, Mapping):
-            value = ",".join(f"{name}:{number!r}" for name, number in self.value.items())
-        else:
-            value = ",".join(map(repr, self.value))
+            what, named = "canonical", self.value.items()
+            value = ",".join(f"{name}:{number!r}" for name, number in named)
         widths = self.tolerance if isinstance(self.tolerance, tuple) else (self.tolerance,)
         tolerance = "" if widths == (0.0,) else "~" + ",".join(map(repr, widths))
-        return f"{self.time!r}:{format_operator(self.operator)}={value}{tolerance}"
+        return f"{self.time!r}:{what}={value}{tolerance}"
 
-    def coordinates(self, kinematics: Kinematics) -> tuple[Tensor, list[int] | None]:
-        """Compute the operator's coordinates (D,), and the joints asked for if not all.
+    def coordinates(self, kinematics: Kinematics) -> Tensor:
+        """Compute the operator's coordinates (D,).
 
         Parameters
         ----------
         kinematics : Kinematics
-            The robot, whose joints a value may name; those it does not name are 0.
+            The robot, whose joints a value may name.
 
         Raises
         ------
@@ -149,14 +147,7 @@ class ViaPoint:
         """
         like, size, value = kinematics.lower, self.operator.dimension(kinematics), self.value
         if isinstance(value, Mapping):
-            names = kinematics.joint_names
-            for name in value:
-                if name not in names:
-                    raise UnknownNameError("joint", name, "the model", names)
-            wanted, rows = like.new_zeros(size), sorted(map(names.index, value))
-            for name, number in value.items():
-                wanted[names.index(name)] = number
-            return wanted, rows
+            value = tuple(value[name] for name in kinematics.joint_names if name in value)
         wanted = torch.tensor(value, dtype=like.dtype, device=like.device)
         if len(wanted) != size:
             raise ShapeError(
@@ -172,7 +163,7 @@ class ViaPoint:
                     "not 1"
                 )
             wanted[part] = quaternions.normalize(wanted[part])
-        return wanted, None
+        return wanted
 
     def variances(self, n_displacements: int) -> list[float]:
         """Return the variance of each displacement that is asked for.

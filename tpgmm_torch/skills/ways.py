@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -13,11 +12,11 @@ from torch import Tensor
 
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import Bounds, RobotState
 from tpgmm_torch.skills.skill import CompositeSkill
 
 __all__ = ["Ways"]
@@ -105,8 +104,7 @@ class Ways(CompositeSkill):
         for one in skills:
             if one.kinematics.joint_names != skills[0].kinematics.joint_names:
                 raise DataError("the ways are of different robots")
-        for name, value in (("skills", skills), ("weights", weights), ("limits", limits)):
-            object.__setattr__(self, name, value)
+        vars(self).update(skills=skills, weights=weights, limits=limits)
 
     @property
     def summary(self) -> TrainingSummary | None:
@@ -118,7 +116,7 @@ class Ways(CompositeSkill):
         """The way of all robots, or of the first."""
         return self.skills[0 if self.chosen is None else int(self.chosen.flatten()[0])]
 
-    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+    def start(self, joints: Tensor, frames: Frames) -> Self:
         """Choose the way of each robot.
 
         Parameters
@@ -138,7 +136,7 @@ class Ways(CompositeSkill):
             return some
         return replace(some, chosen=some.chosen[robots])
 
-    def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
+    def choose(self, joints: Any, frames: Frames) -> list[WayChoice]:
         """Return the way for each robot, and why; each way is tried on a coarse grid of time.
 
         Parameters
@@ -166,7 +164,7 @@ class Ways(CompositeSkill):
         parts = zip(score.argmax(1).tolist(), shares, novelty, misfit, strict=True)
         return [WayChoice(*part) for part in parts]
 
-    def _misfit(self, way: int, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
+    def _misfit(self, way: int, joints: Tensor, frames: Frames) -> Array:
         """Compute how much less likely a reproduction is than demonstrations, (B,) [nats]."""
         skill, worst = self.skills[way], torch.zeros(len(joints), dtype=torch.float64)
         bounds = skill.kinematics.lower, skill.kinematics.upper
@@ -176,11 +174,7 @@ class Ways(CompositeSkill):
         return as_array((worst - self.limits[way]).clamp(min=0.0))
 
     def estimate(
-        self,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames, bounds: Bounds = None
     ) -> Estimate:
         """See :meth:`Skill.estimate`: each robot's by its way."""
         if self.chosen is None:
@@ -205,7 +199,7 @@ class Ways(CompositeSkill):
         return own.begin + share * (own.end - own.begin)
 
 
-def _novelty(skill: Regression, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
+def _novelty(skill: Regression, joints: Tensor, frames: Frames) -> Array:
     """Novelty (B,) of situations to one way."""
     if skill.summary is None:
         return np.zeros(len(joints))

@@ -10,8 +10,8 @@ from typing import Any
 from sklearn.pipeline import Pipeline, make_pipeline
 
 from tpgmm_torch.alignment.base import Alignment
-from tpgmm_torch.alignment.piecewise_linear import EventAlignment
-from tpgmm_torch.alignment.text import parse_alignment
+from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -21,6 +21,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import default_operators
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.structure.select_components import SelectComponents
@@ -28,6 +29,9 @@ from tpgmm_torch.structure.select_operators import SelectOperators
 from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
+
+#: Names of alignments.
+ALIGNMENTS = ("dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none")
 
 
 @dataclass(frozen=True)
@@ -67,20 +71,46 @@ class Choices:
 
 
 def aligner(
-    method: str, robot: Kinematics | None, features: Sequence[str] | None = None
+    method: str, robot: Kinematics | None = None, features: Sequence[str] | None = None
 ) -> Alignment | Pipeline | None:
-    """Make the transformer of a name: :func:`parse_alignment`, or "parts", found first.
+    """Make the transformer of a name; None for ``"none"``.
 
     Parameters
     ----------
     method : str
+        One of :data:`ALIGNMENTS`; ``"events+dtw"`` warps time between events, ``"parts"`` finds
+        where parts end first.
     robot : Kinematics, optional
+        Gives link positions, and where joints hold quaternions.
     features : sequence of str, optional
-        Compared by time warping.
+        Compared by time warping, as in :class:`DynamicTimeWarping`.
+
+    Raises
+    ------
+    DataError
+        If there is no such alignment.
+
+    Examples
+    --------
+    >>> aligner("linear")
+    LinearTimeNormalization()
     """
-    if method != "parts":
-        return parse_alignment(method, robot, features)
-    return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
+    reference = "barycenter" if method == "barycenter" else "medoid"
+    warping = DynamicTimeWarping(reference, features=features, robot=robot)
+    match method:
+        case "none":
+            return None
+        case "linear":
+            return LinearTimeNormalization(robot=robot)
+        case "events":
+            return EventAlignment(robot=robot)
+        case "events+dtw":
+            return EventAlignment(within=warping, robot=robot)
+        case "dtw" | "barycenter":
+            return warping
+        case "parts":
+            return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
+    raise DataError(f"an alignment is one of {list(ALIGNMENTS)}, got {method!r}")
 
 
 def operators_or_default(
@@ -161,7 +191,7 @@ def prepare_demonstrations(
 
 def learn(
     model: TaskParameterizedGMM, source: Any, choices: Choices, processes: Processes = ALONE
-) -> tuple[Any, list[str]]:
+) -> tuple[TaskParameterizedGMM | Skill, list[str]]:
     """Fit a model, with what is to be found first.
 
     Parameters

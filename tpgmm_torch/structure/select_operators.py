@@ -251,10 +251,7 @@ class SelectOperators(DemonstrationEstimator):
         return sorted(self._drop(chosen, operators, mean))
 
     def _drop(
-        self,
-        chosen: list[int],
-        operators: Sequence[Operator],
-        mean: Callable[..., float],
+        self, chosen: list[int], operators: Sequence[Operator], mean: Callable[..., float]
     ) -> list[int]:
         """Drop operators, but for those of all joints, that gain little beside the others."""
         free = [j for j in chosen if not operators[j].determines_joints]

@@ -20,10 +20,12 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.ways import Ways
 from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import comparable_coordinates
+from tpgmm_torch.training.shares import Share
 from tpgmm_torch.training.training_rows import read_rows
 
 __all__ = ["SelectWays"]
@@ -201,7 +203,7 @@ class SelectWays(DemonstrationEstimator):
         shown = [[one for k, one in pairs if k == way] for way in range(self.n_ways_)]
         self.models_ = [clone(self.model).fit(own) for own in shown]
         self.skill_: Ways | Regression = self.models_[0].skill
-        self.best_model_: Any = self.models_[0]
+        self.best_model_: TaskParameterizedGMM | Skill = self.models_[0]
         if self.n_ways_ > 1:
             skills = tuple(model.skill for model in self.models_)
             limits = tuple(map(_largest_surprise, skills, shown))
@@ -239,7 +241,7 @@ class SelectWays(DemonstrationEstimator):
     def _views(self, known: Sequence[Demonstration]) -> list[_View]:
         operators, robot = check_operators(self.model.operators), self.model.robot
         kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
-        rows = read_rows([known], operators, kinematics)
+        rows = read_rows(Share(known), operators, kinematics)
         self._time = as_array(rows.time)
         data = rows.at_phases(len(rows.time))
         return [
@@ -308,7 +310,9 @@ def _divide_along(
     if not best:
         return None
     labels, gain = partitions[best], float(scores[best] - scores[0])
-    apart = _separation(along, labels, view.near)
+    means, squares = _scatter(along, labels)
+    within = max(math.sqrt(squares / (len(along) - len(means))), view.near)
+    apart = float(np.diff(np.sort(means)).min() / within)
     return _Split(labels, bic, float(bic[best] - bic[0]), gain, apart, view, stretch)
 
 
@@ -374,13 +378,6 @@ def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> flo
     log_density = -0.5 * (free * math.log(2 * math.pi * variance) + squares / variance)
     log_means = -0.5 * float(np.log(sizes).sum()) - len(means) * math.log(wide)
     return log_density + log_means + float((sizes * np.log(sizes / n)).sum())
-
-
-def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
-    """Smallest distance of two modes' means, in standard deviations within them."""
-    means, squares = _scatter(values, labels)
-    within = max(math.sqrt(squares / (len(values) - len(means))), near)
-    return float(np.diff(np.sort(means)).min() / within)
 
 
 def _is_situation(split: _Split, views: Sequence[_View]) -> bool:

@@ -339,13 +339,8 @@ def _most_common_holds(shown: Sequence[list[Hold]], agreement: float) -> list[Ho
     if count < max(agreement * len(shown), 1):
         return []
     alike = [holds for holds, links in zip(shown, orders, strict=True) if links == order]
-    return _in_order(
-        [
-            replace(
-                holds[0],
-                begin=median(hold.begin for hold in holds),
-                end=median(hold.end for hold in holds),
-            )
-            for holds in zip(*alike, strict=True)
-        ]
-    )
+    typical = []
+    for holds in zip(*alike, strict=True):
+        begin, end = median(hold.begin for hold in holds), median(hold.end for hold in holds)
+        typical.append(replace(holds[0], begin=begin, end=end))
+    return _in_order(typical)

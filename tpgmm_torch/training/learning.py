@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -25,14 +25,10 @@ from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import of_joints
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.mixture_settings import (
-    block_widths,
-    check_operators,
-    kinematics_for,
-    regularization,
-)
+from tpgmm_torch.training import mixture_settings
 from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
-from tpgmm_torch.training.training_rows import TrainingRows, batches_of, check_alike, read_rows
+from tpgmm_torch.training.shares import Share
+from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 #: Parameters of the estimator that are the mixture's too.
 SHARED = (
@@ -104,26 +100,21 @@ def learn(
         If demonstrations do not fit together, or with the robot and the operators, or cannot
         be what they are taken for.
     """
-    operators, batches = check_operators(settings["operators"]), batches_of(X)
-    head = next(batches, [])
-    check_alike(head, processes)
+    operators = mixture_settings.check_operators(settings["operators"])
+    share, robot = Share(X, processes), settings["robot"]
     where = settings["dtype"], settings["device"]
-    kinematics = kinematics_for(head, operators, settings["robot"], *where)
+    kinematics = mixture_settings.kinematics_for(share.first, operators, robot, *where)
     if settings["fusion"] is not None:
         settings["fusion"].check(of_joints(operators), kinematics)
     read: list[tuple[EpisodeSummary, Array, Array | None]] = []
 
-    def summarize_batches() -> Iterator[Sequence[Demonstration]]:
-        for batch in chain([head], batches):
-            ordered = [one.reorder(kinematics.joint_names) for one in batch]
-            peaks, gaps = map(joint_peaks, ordered), map(episode_gaps, ordered)
-            read.extend(zip(summarize(batch, kinematics), peaks, gaps, strict=True))
-            yield batch
+    def watch(one: Demonstration) -> None:
+        ordered = one.reorder(kinematics.joint_names)
+        peaks, gaps = joint_peaks(ordered), episode_gaps(ordered)
+        read.extend((summary, peaks, gaps) for summary in summarize([one], kinematics))
 
-    rows = read_rows(
-        summarize_batches(), operators, kinematics,
-        responsibilities=settings["responsibilities"], processes=processes,
-    )  # fmt: skip
+    shared = settings["responsibilities"]
+    rows = read_rows(share, operators, kinematics, responsibilities=shared, watch=watch)
     rows = rows if interval is None else rows.within(*interval)
     episodes, peaks, gaps = zip(*chain.from_iterable(processes.gather(read)), strict=True)
     _report(rows, episodes, kinematics, settings)
@@ -132,20 +123,13 @@ def learn(
     mixture = BlockGaussianMixture(
         **_of_mixture(settings, rows.operators, kinematics),
         group_size=rows.group_size,
-        reg_covar=regularization(moments, rows.operators, kinematics, **shape),
+        reg_covar=mixture_settings.regularization(moments, rows.operators, kinematics, **shape),
     ).fit(rows.rows, processes=processes)
     _shrink(mixture, rows, kinematics, settings)
-    return Learned(
-        mixture,
-        rows.operators,
-        kinematics,
-        rows.time,
-        rows.holds,
-        rows.n_demonstrations,
-        typical_peaks(peaks),
-        TrainingSummary.of(episodes, kinematics),
-        CommandGaps.learn(gaps, rows.time),
-    )
+    shown = rows.operators, kinematics, rows.time, rows.holds, rows.n_demonstrations
+    summary = TrainingSummary.of(episodes, kinematics)
+    learned_gaps = CommandGaps.learn(gaps, rows.time)
+    return Learned(mixture, *shown, typical_peaks(peaks), summary, learned_gaps)
 
 
 def from_parameters(
@@ -179,7 +163,8 @@ def from_parameters(
     weights, time = as_tensor(weights, "weights"), as_tensor(time, "time")
     means = [as_tensor(mean, "a mean") for mean in means]
     covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
-    operators, robot = check_operators(settings["operators"]), settings["robot"]
+    operators = mixture_settings.check_operators(settings["operators"])
+    robot = settings["robot"]
     if robot is None:
         raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
     if settings["fusion"] is not None:
@@ -198,9 +183,8 @@ def _of_mixture(
     settings: Mapping[str, Any], operators: Sequence[Operator], kinematics: Kinematics
 ) -> dict[str, Any]:
     """Collect parameters of the mixture of the local data of all operators."""
-    return {name: settings[name] for name in SHARED} | {
-        "blocks": block_widths(operators, kinematics)
-    }
+    blocks = mixture_settings.block_widths(operators, kinematics)
+    return {name: settings[name] for name in SHARED} | {"blocks": blocks}
 
 
 def _shrink(

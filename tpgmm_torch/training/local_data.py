@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import Frames
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
@@ -38,7 +38,7 @@ class Motion:
 
     time: Tensor
     state: RobotState
-    frames: Mapping[str, Frame]
+    frames: Frames
 
     @classmethod
     def of(

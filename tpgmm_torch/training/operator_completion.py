@@ -153,12 +153,8 @@ def with_mean_orientations(
         if operator.geometry != "tangent" or operator.path is not None:
             return operator
         plain = replace(operator, geometry="quaternion")
-        shown = [
-            quaternions.interpolate(
-                instants, one.time.double(), one.coordinates(plain, kinematics).double()
-            )
-            for one in motions
-        ]
+        seen = ((one.time, one.coordinates(plain, kinematics)) for one in motions)
+        shown = [quaternions.interpolate(instants, t.double(), q.double()) for t, q in seen]
         means = quaternions.mean(torch.stack(shown, -2))
         rows = torch.cat((instants.unsqueeze(-1), means), -1)
         return replace(operator, path=tuple(map(tuple, rows.tolist())))

@@ -25,6 +25,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.hold_detection import attach_holds
 from tpgmm_torch.training.local_data import at_phases
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.shares import Share
 from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 __all__ = ["drop_outliers"]
@@ -64,9 +65,7 @@ def outlying_demonstrations(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    *,
-    threshold: float = 8.0,
-    duration: float = 0.5,
+    **settings: float,
 ) -> tuple[Outlying, ...]:
     """Find demonstrations far from the median, at instants at which others agree.
 
@@ -85,12 +84,8 @@ def outlying_demonstrations(
         In whose local coordinates it is seen.
     kinematics : Kinematics
         On which the operators act.
-    threshold : float, default=8.0
-        So many robust standard deviations from the median are unlike the others. On real
-        recordings those who are not reach 6.1, those whose frame was taken at a wrong instant,
-        5 to 15 cm beside the right one, at least 11.6.
-    duration : float, default=0.5
-        For how long in all [s].
+    **settings
+        Of :func:`outlying_rows`.
 
     Returns
     -------
@@ -99,8 +94,8 @@ def outlying_demonstrations(
     """
     if len(demonstrations) < FEWEST:  # nothing is read
         return ()
-    rows = read_rows([demonstrations], operators, kinematics)
-    return outlying_rows(rows, kinematics, threshold=threshold, duration=duration)
+    rows = read_rows(Share(demonstrations), operators, kinematics)
+    return outlying_rows(rows, kinematics, **settings)
 
 
 def outlying_rows(
@@ -114,8 +109,12 @@ def outlying_rows(
         Of all demonstrations.
     kinematics : Kinematics
         On which the operators act.
-    threshold, duration : float
-        As there.
+    threshold : float, default=8.0
+        So many robust standard deviations from the median are unlike the others. On real
+        recordings those who are not reach 6.1, those whose frame was taken at a wrong instant,
+        5 to 15 cm beside the right one, at least 11.6.
+    duration : float, default=0.5
+        For how long in all [s].
     """
     number = rows.n_demonstrations
     if number < FEWEST:
@@ -227,9 +226,8 @@ def drop_outliers(
     known, operators = check_demonstrations(demonstrations), check_operators(operators)
     kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
     known = attach_holds(known, kinematics)
-    outlying = outlying_demonstrations(
-        known, operators, kinematics, threshold=threshold, duration=duration
-    )
+    settings = {"threshold": threshold, "duration": duration}
+    outlying = outlying_demonstrations(known, operators, kinematics, **settings)
     if outlying:
         finding = replace(unlike_the_others(outlying, len(known)), remedy="They are left out")
         Report.of([finding], f"{len(known)} demonstrations").act()

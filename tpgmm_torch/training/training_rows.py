@@ -8,7 +8,7 @@ many demonstrations there are: data beyond memory become a table of the length o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Any, Self
@@ -18,23 +18,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training import local_data
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import (
-    Motion,
-    at_phases,
-    constant_columns,
-    like,
-    match_rows,
-)
 from tpgmm_torch.training.mixture_settings import block_widths
 from tpgmm_torch.training.operator_completion import with_force_axes, with_mean_orientations
+from tpgmm_torch.training.shares import Share
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +81,8 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        episodes = (self.stored[start:stop] for start, stop in pairwise(self.edges))
-        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in episodes])
+        episodes = (torch.from_numpy(self.stored[i:j]) for i, j in pairwise(self.edges))
+        thinned = torch.stack([local_data.at_phases(rows, count) for rows in episodes])
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
@@ -108,162 +104,70 @@ class TrainingRows:
         )
 
 
-def batches_of(X: Any) -> Iterator[list[Demonstration]]:
-    """Check demonstrations batch by batch; a list of them is one batch.
-
-    Parameters
-    ----------
-    X : iterable of Demonstration, or of sequence of Demonstration
-        Batches are read once.
-
-    Yields
-    ------
-    list of Demonstration
-
-    Raises
-    ------
-    DataError, ShapeError
-        If some differ from those before in joints or frames; the message says in which batch.
-    """
-    first: list[Demonstration] = []
-    for number, batch in enumerate(_split(X)):
-        try:
-            checked = check_demonstrations([*first, *batch])[len(first) :]
-        except (ValueError, TypeError) as error:
-            if number == 0:
-                raise
-            kind = type(error) if isinstance(error, DataError) else DataError
-            raise kind(f"batch {number} of demonstrations: {error}") from error
-        first = first or checked[:1]
-        yield checked
-
-
-def _split(X: Any) -> Iterator[Sequence[Demonstration]]:
-    """Yield the batches of X, without empty ones; X itself if it holds demonstrations."""
-    if not isinstance(X, Iterable):
-        check_demonstrations(X)  # says what is wrong
-    walk = iter(X)
-    first = next(walk, None)
-    if isinstance(first, Sequence):
-        yield from (batch for batch in chain([first], walk) if len(batch))
-    elif first is not None:
-        yield list(chain([first], walk))
-
-
-def check_alike(batch: Sequence[Demonstration], processes: Processes) -> None:
-    """Refuse, in all processes, shares without demonstrations, or of other joints or frames.
-
-    Parameters
-    ----------
-    batch : sequence of Demonstration
-        The first of this process; empty if it has none.
-    processes : Processes
-        All of which need demonstrations of the same joints and frames.
-
-    Raises
-    ------
-    DataError
-        If they do not have them; the message says in which process.
-    """
-    text = ""
-    for first in batch[:1]:
-        joints = list(first.joint_names or [f"{first.n_joints} without names"])
-        text = f"joints {joints}, frames {sorted(first.frames)}"
-    texts = processes.gather(text)
-    processes.check_share(texts, "demonstration")
-    for rank, other in enumerate(texts):
-        if other != texts[0]:
-            raise DataError(
-                f"process {rank} has demonstrations with {other}, process 0 with {texts[0]}"
-            )
-
-
 def read_rows(
-    batches: Iterable[Sequence[Demonstration]],
+    share: Share,
     operators: Sequence[Operator],
     kinematics: Kinematics,
     *,
     responsibilities: str = "auto",
-    processes: Processes = ALONE,
+    watch: Callable[[Demonstration], object] = id,
 ) -> TrainingRows:
     """Compute the local coordinates of all demonstrations, each once.
 
-    Rows of one batch stay in memory, those of several go to a temporary file.
-    The first batch of all decides on holds, mean orientations, and the side of quaternions.
+    Rows of one list stay in memory, those of more go to a temporary file. The first batch of
+    all decides on holds, mean orientations, and the side of quaternions.
 
     Parameters
     ----------
-    batches : iterable of sequence of Demonstration
-        Of this process, at least one.
+    share : Share
+        Demonstrations of this process.
     operators : sequence of Operator
         In whose local coordinates it is seen.
     kinematics : Kinematics
         On which the operators act.
     responsibilities : {"auto", "instant", "point"}
         Whether one is for all points of an instant, as of the estimator.
-    processes : Processes
-        Among which the rows are spread.
+    watch : callable, optional
+        Sees each demonstration, too.
 
     Raises
     ------
     DataError
         If ``responsibilities="instant"`` and the demonstrations have different time grids.
     """
-    walk = iter(batches)
-    head, later = next(walk), next(walk, None)
-    alone = later is None and processes.count == 1
-    holds = processes.gather(demonstrated_holds(head, operators, kinematics))[0]
-    motions = [Motion.of(one, kinematics, holds) for one in head]
+    processes = share.processes
+    holds = processes.gather(demonstrated_holds(share.first, operators, kinematics))[0]
+    motions = [local_data.Motion.of(one, kinematics, holds) for one in share.first]
     completed = with_mean_orientations(with_force_axes(operators, motions), motions, kinematics)
     operators = processes.gather(completed)[0]
-    following = chain.from_iterable(chain([later or ()], walk))
-    all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
-    seen = ((m, [m.coordinates(one, kinematics) for one in operators]) for m in all_motions)
+    later = ((one, local_data.Motion.of(one, kinematics, holds)) for one in share.read_rest())
+    pairs = chain(zip(share.first, motions, strict=True), later)
+    seen = ((d, m, [m.coordinates(one, kinematics) for one in operators]) for d, m in pairs)
     first = next(seen)
-    shown = processes.gather([block.cpu() for block in first[1]])[0]
-    side = like([block.to(kinematics.lower) for block in shown])
-    episodes = (
-        match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
-        for motion, blocks in chain([first], seen)
-    )
-    stored, edges = _store_rows(episodes, alone)
-    reference = _remove_rounding(stored, edges[1], operators, kinematics, processes)
+    shown = processes.gather([block.cpu() for block in first[-1]])[0]
+    side = local_data.like([block.to(kinematics.lower) for block in shown])
+    stored: Any = [] if share.in_memory else RowFile()
+    lengths = [0]
+    for demonstration, motion, blocks in chain([first], seen):
+        watch(demonstration)
+        rows = local_data.match_rows(motion, blocks, operators, kinematics, side).cpu().numpy()
+        lengths.append(len(rows))
+        stored.append(rows)
+    stored, edges = np.concatenate(stored) if share.in_memory else stored, np.cumsum(lengths)
+    # what varies by rounding alone becomes constant
+    moments = ColumnMoments.of(stored, processes)
+    reference = processes.gather(stored[: edges[1]])[0]
+    ends = np.stack((moments.smallest, moments.largest)).astype(reference.dtype)
+    low, high = torch.from_numpy(ends)
+    constant = local_data.constant_columns(low, high, operators, kinematics).numpy()
+    stored[:, constant] = reference[0, constant]
+    reference = np.where(constant, reference[0], reference)
     time, number = _typical_time(stored, edges, processes)
     time = time.to(kinematics.lower)
-    rows = TrainingRows(
-        stored, 1, time, number, tuple(operators), holds, processes, stored, edges
-    )
-    return _group_instants(
-        rows, reference, responsibilities, block_widths(operators, kinematics)
-    )
-
-
-def _store_rows(episodes: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
-    """Store rows, in a file unless of one batch, and where each demonstration begins."""
-    kept: Any = [] if alone else RowFile()
-    lengths = [0]
-    for rows in episodes:
-        lengths.append(len(rows))
-        kept.append(rows)
-    return np.concatenate(kept) if alone else kept, np.cumsum(lengths)
-
-
-def _remove_rounding(
-    stored: Rows,
-    length: int,
-    operators: Sequence[Operator],
-    kinematics: Kinematics,
-    processes: Processes,
-) -> NDArray[Any]:
-    """Make constant what varies by rounding alone; return the first demonstration."""
-    moments = ColumnMoments.of(stored, processes)
-    first = processes.gather(stored[:length])[0]
-    low, high = (
-        torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
-    )
-    constant = constant_columns(low, high, operators, kinematics).numpy()
-    stored[:, constant] = first[0, constant]
-    return np.where(constant, first[0], first)
+    every = tuple(operators)
+    found = TrainingRows(stored, 1, time, number, every, holds, processes, stored, edges)
+    widths = block_widths(operators, kinematics)
+    return _group_instants(found, reference, responsibilities, widths)
 
 
 def _group_instants(
@@ -322,11 +226,8 @@ def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
 
 
 def equivalent_rows(
-    rows: Rows,
-    reference: NDArray[np.float64],
-    widths: Sequence[int],
-    processes: Processes = ALONE,
-) -> tuple[NDArray[np.float64], int]:
+    rows: Rows, reference: Array, widths: Sequence[int], processes: Processes = ALONE
+) -> tuple[Array, int]:
     """Replace the demonstrations of all processes by rows, some per instant.
 
     Parameters

@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from tpgmm_torch.atomic import read_whole, replacing
 from tpgmm_torch.data.pose_names import is_gripper
@@ -49,6 +50,8 @@ __all__ = ["Cell", "read_cell", "write_cell"]
 
 #: Poses that are nearer to each other are the same: [mm], [deg].
 SAME_PLACE, SAME_ANGLE = 0.1, 0.02
+#: How many numbers each part of a lens has.
+LENS = {"focal_length": 2, "principal_point": 2, "distortion": 5}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,9 +146,8 @@ class Cell:
         for kind in ("cameras", "objects", "checks"):
             before, after = getattr(self, kind), getattr(other, kind)
             for name in sorted(before.keys() | after):
-                if name not in before or name not in after:
-                    changes = [f"is {'missing' if name in before else 'new'}"]
-                else:
+                changes = [f"is {'missing' if name in before else 'new'}"]
+                if name in before and name in after:
                     contents = self.content[kind][name], other.content[kind][name]
                     changes = _compare_entries(*contents)
                     changes += _compare_poses(before[name].pose, after[name].pose)
@@ -178,9 +180,8 @@ class Cell:
         if not self.cameras:
             raise DataError("the cell has no cameras: tpgmm calibrate camera adds one")
         if missing := [name for name, one in self.cameras.items() if one.pose is None]:
-            raise DataError(
-                f"cameras {missing} of the cell have no pose: tpgmm calibrate cell finds it"
-            )
+            problem = f"cameras {missing} of the cell have no pose"
+            raise DataError(f"{problem}: tpgmm calibrate cell finds it")
         return dict(self.cameras)
 
 
@@ -217,10 +218,8 @@ def check_robot(cell: Cell, robot: Any) -> None:
         if cell.links:
             raise DataError(f"cameras of the cell are on links {cell.links}: give the robot")
         return
-    ours, theirs = (
-        {name for name in joints if not is_gripper(name)}
-        for joints in (robot.joint_names, cell.joints)
-    )
+    both = robot.joint_names, cell.joints
+    ours, theirs = ({one for one in joints if not is_gripper(one)} for joints in both)
     if not (ours <= theirs or theirs <= ours):
         raise DataError(
             f"the cell is that of another robot, with the joints {list(cell.joints)}, this one "
@@ -229,6 +228,39 @@ def check_robot(cell: Cell, robot: Any) -> None:
     for link in cell.links:
         if link not in robot.links:
             raise UnknownNameError("link", link, "the robot", robot.links)
+
+
+def camera_poses(cell: Cell, robot: Any, joints: Mapping[str, float]) -> dict[str, Array]:
+    """``base_from_camera`` (4, 4) of all cameras of a cell.
+
+    Parameters
+    ----------
+    cell : Cell
+    robot : Kinematics, optional
+        Needed where a camera is on a link.
+    joints : mapping of str to float
+        Of the robot's description, offsets included [rad].
+
+    Raises
+    ------
+    UnknownNameError
+        If a joint is missing.
+    """
+    links = {}
+    if cell.links:
+        for name in robot.joint_names:
+            if name not in joints:
+                raise UnknownNameError("joint", name, "the measured joints", joints)
+        values = [[joints[name] for name in robot.joint_names]]
+        state = robot.state(torch.tensor(values).to(robot.lower))
+        for link in cell.links:
+            pose = torch.cat((state.position(link), state.orientation(link)), dim=-1)
+            links[link] = pose_matrix(pose[0].double().cpu().numpy())
+    placed = {}
+    for name, one in cell.require_placed_cameras().items():
+        assert one.pose is not None
+        placed[name] = one.pose if one.link is None else links[one.link] @ one.pose
+    return placed
 
 
 def cell_of(given: Mapping[str, Any] | str | Path) -> Cell:
@@ -274,11 +306,9 @@ def write_cell(content: Mapping[str, Any], path: str | Path) -> Cell:
 
 def _format_content(content: Mapping[str, Any]) -> str:
     """JSON in which lists of numbers take one line each."""
-
-    def one_line(found: re.Match[str]) -> str:
-        return re.sub(r"\n *", "", found[0].replace(",\n", ", \n"))
-
-    return re.sub(r"\[[^][{}]*\]", one_line, json.dumps(content, indent=2)) + "\n"
+    parts = re.split(r"(\[[^][{}]*\])", json.dumps(content, indent=2) + "\n")
+    parts[1::2] = [re.sub(r"\n *", "", one.replace(",\n", ", \n")) for one in parts[1::2]]
+    return "".join(parts)
 
 
 def cell_from(content: Any, where: str = "the cell") -> Cell:
@@ -328,27 +358,22 @@ def _entries(
 ) -> dict[str, Any]:
     """Read the entries of an object."""
     readers = {**needed, **other}
-    if not isinstance(value, Mapping):
-        raise DataError(f"{where} is an object with {list(readers)}, got {value!r}")
+    _plain(Mapping, f"an object with {list(readers)}")(value, where)
     if extra := [name for name in value if name not in readers]:
         raise DataError(f"{where} has no entries {extra}; there are {list(readers)}")
     for name in needed:
         if value.get(name) is None:
             raise DataError(f"{where} needs {name!r}; it has {list(value)}")
-    return {
-        name: read(value[name], f"{where}: {name}")
-        for name, read in readers.items()
-        if value.get(name) is not None
-    }
+    there = [name for name in readers if value.get(name) is not None]
+    return {name: readers[name](value[name], f"{where}: {name}") for name in there}
 
 
 def _mapping(reader: _Reader) -> _Reader:
     """Make a reader of an object of named entries."""
 
     def read(value: Any, where: str) -> dict[str, Any]:
-        if not isinstance(value, Mapping):
-            raise DataError(f"{where} is an object of named entries, got {value!r}")
-        return {name: reader(one, f"{where}: {name}") for name, one in value.items()}
+        entries = _plain(Mapping, "an object of named entries")(value, where)
+        return {name: reader(one, f"{where}: {name}") for name, one in entries.items()}
 
     return read
 
@@ -382,8 +407,8 @@ _text, _flag = _plain(str, "a text"), _plain(bool, "true or false")
 
 
 def _texts(value: Any, where: str) -> tuple[str, ...]:
-    given = _plain(list | tuple, "a list of texts")(value, where)
-    return tuple(_text(one, where) for one in given)
+    kind = "a list of texts"
+    return tuple(_text(one, where) for one in _plain(list | tuple, kind)(value, where))
 
 
 def _pose(value: Any, where: str) -> Array:
@@ -404,10 +429,10 @@ def _target(value: Any, where: str) -> Target:
 
 
 def _camera(value: Any, where: str) -> CellCamera:
-    numbers = {"size": 2, "focal_length": 2, "principal_point": 2}
-    needed = {"key": _text, **{name: _numbers(n) for name, n in numbers.items()}}
-    other = {"distortion": _numbers(5), "pose": _pose, "link": _text, "report": _text}
-    lens = _entries(value, where, needed, other)
+    numbers = {name: _numbers(n) for name, n in LENS.items()}
+    other = {"distortion": numbers.pop("distortion"), "pose": _pose}
+    other |= {"link": _text, "report": _text}
+    lens = _entries(value, where, {"key": _text, "size": _numbers(2), **numbers}, other)
     size, mount = lens.pop("size"), {n: lens.pop(n, None) for n in ("key", "pose", "link")}
     lens.pop("report", None)
     return CellCamera(_make_at(Camera, where, *map(int, size), **lens), **mount)
@@ -424,13 +449,8 @@ def _check(value: Any, where: str) -> CellCheck:
 
 def camera_content(camera: Camera, key: str) -> dict[str, Any]:
     """Entry in a cell file of a camera without a pose."""
-    return {
-        "key": key,
-        "size": [camera.width, camera.height],
-        "focal_length": list(camera.focal_length),
-        "principal_point": list(camera.principal_point),
-        "distortion": list(camera.distortion),
-    }
+    lens = {name: list(getattr(camera, name)) for name in LENS}
+    return {"key": key, "size": [camera.width, camera.height], **lens}
 
 
 def pose_content(pose: Array) -> list[float]:

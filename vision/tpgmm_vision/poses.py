@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from tpgmm_torch.exceptions import DataError
 
 Array = NDArray[np.float64]
+#: Of shape (height, width, 3), RGB, or (height, width).
+Picture = NDArray[np.uint8]
 #: Poses further than this from the middle of all, or this many times their median distance, do
 #: not count in a mean: [m], [rad], and the share.
 INLIER_DISTANCE, INLIER_ANGLE, INLIER_SHARE = 0.002, np.radians(2.0), 3.0
@@ -83,6 +85,13 @@ def pose_vector(pose: Array) -> Array:
     flat = np.asarray(pose, dtype=float).reshape(-1, 4, 4)
     turn = np.roll(Rotation.from_matrix(flat[:, :3, :3]).as_quat(canonical=True), 1, axis=-1)
     return np.concatenate((flat[:, :3, 3], turn), axis=-1).reshape(*pose.shape[:-2], 7)
+
+
+def cross_matrix(vectors: Array) -> Array:
+    """Make the matrices of cross products ``v x .`` (..., 3, 3)."""
+    made = np.zeros((*vectors.shape, 3))
+    made[..., [2, 0, 1], [1, 2, 0]], made[..., [1, 2, 0], [2, 0, 1]] = vectors, -vectors
+    return made
 
 
 def angle_between(one: Array, other: Array) -> float:

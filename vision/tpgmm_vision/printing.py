@@ -167,11 +167,9 @@ def _board(board: Board, page: str) -> Any:
     """Draw a board."""
     square, marker, drawn = board.square * 1e3, board.marker * 1e3, board.drawn
     columns, rows = drawn.getChessboardSize()
-    words = (
-        f"{columns} x {rows} squares of {square:g} mm, {board.family} of {marker:g} mm. {GLUE}"
-    )
-    extent = (columns, 0), (rows, 0)
-    axes, free = _axes(page, words, "a board with squares", square, square, *extent)
+    words = f"{columns} x {rows} squares of {square:g} mm, {board.family} of {marker:g} mm."
+    sizes = square, square, (columns, 0), (rows, 0)
+    axes, free = _axes(page, f"{words} {GLUE}", "a board with squares", *sizes)
     corner = np.array([(free[0] - columns * square) / 2, 0])
     markers = np.array(drawn.getObjPoints())[:, :, :2] * (1e3, -1e3)  # whose y is down
     for number, one in zip(drawn.getIds().ravel(), markers, strict=True):
@@ -210,14 +208,11 @@ def _axes(
     """
     sheets = PAGES[page], PAGES[page][::-1]
     frees = [(width - 2 * MARGIN, height - 2 * MARGIN - FOOTER) for width, height in sheets]
-    fits = [
-        min((a - more) / n for a, (n, more) in zip(free, extent, strict=True)) for free in frees
-    ]
+    (columns, across), (rows, along) = extent
+    fits = [min((width - across) / columns, (height - along) / rows) for width, height in frees]
     if edge > max(fits):
-        most = f"{np.floor(max(fits) * size / edge):g} mm would"
-        raise DataError(
-            f"{what} of {size:g} mm does not fit on a page {page!r}, {most}: {UNITS}"
-        )
+        most = f"{np.floor(max(fits) * size / edge):g} mm would: {UNITS}"
+        raise DataError(f"{what} of {size:g} mm does not fit on a page {page!r}, {most}")
     turned = edge > fits[0]
     (width, height), free = sheets[turned], frees[turned]
     axes = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH)).add_axes((0, 0, 1, 1))

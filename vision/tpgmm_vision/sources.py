@@ -6,11 +6,8 @@ from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
-from tpgmm_vision.poses import Array
+from tpgmm_vision.poses import Array, Picture
 
 __all__ = ["ObservedPose", "PoseSource", "pose_source"]
 
@@ -58,10 +55,7 @@ class PoseSource(Protocol):
         """Forget what was seen: another episode begins."""
 
     def poses(
-        self,
-        images: Mapping[str, NDArray[np.uint8]],
-        joints: Mapping[str, float],
-        time: float,
+        self, images: Mapping[str, Picture], joints: Mapping[str, float], time: float
     ) -> dict[str, ObservedPose]:
         """Find the poses of all objects now.
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.poses import Array, pose_matrix, transform
@@ -45,9 +46,7 @@ def dictionary_of(family: str) -> Any:
         If it is not known.
     """
     if family not in FAMILIES:
-        raise DataError(
-            f"tags of the family {family!r} are not known; there are {list(FAMILIES)}"
-        )
+        raise DataError(f"tags of family {family!r} are not known; there are {list(FAMILIES)}")
     return cv2.aruco.getPredefinedDictionary(FAMILIES[family])
 
 
@@ -73,11 +72,10 @@ class Target:
     family: str = DEFAULT_FAMILY
 
     def __post_init__(self) -> None:
-        count = len(dictionary_of(self.family).bytesList)
-        if any(not 0 <= number < count for number in self.corners):
-            raise DataError(
-                f"a target has tags 0 to {count - 1} of {self.family}, got {list(self.corners)}"
-            )
+        count, numbers = len(dictionary_of(self.family).bytesList), list(self.corners)
+        if any(not 0 <= number < count for number in numbers):
+            wanted = f"tags 0 to {count - 1} of {self.family}"
+            raise DataError(f"a target has {wanted}, got {numbers}")
 
 
 def _square(size: float) -> Array:
@@ -126,16 +124,14 @@ def cube(
     if side < size:
         raise DataError(f"tags of {size} m do not fit on a cube of {side} m")
     corners = {}
-    for number, (normal, up) in zip(numbers, FACES, strict=False):
-        z, y = np.array(normal, dtype=float), np.array(up, dtype=float)
+    for number, face in zip(numbers, FACES, strict=False):
+        z, y = np.array(face, dtype=float)
         turn = np.stack((np.cross(y, z), y, z), axis=1)
         corners[int(number)] = _square(size) @ turn.T + side / 2 * z
     return Target(corners, family)
 
 
-def bundle(
-    poses: Mapping[int, Sequence[float]], size: float, family: str = DEFAULT_FAMILY
-) -> Target:
+def bundle(poses: Mapping[int, ArrayLike], size: float, family: str = DEFAULT_FAMILY) -> Target:
     """Tags at known poses.
 
     Parameters

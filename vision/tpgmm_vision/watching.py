@@ -166,10 +166,8 @@ class Watch:
                 f"{'; '.join(self.missing())}, for {SEARCH_TIME:g} s before the start: bring "
                 f"it into view of {list(self.cell.cameras)}"
             )
-        return {
-            name: np.stack([self._mean(row, k) for row in range(len(self._seen))])
-            for k, name in enumerate(self.names)
-        }
+        rows, called = range(len(self._seen)), enumerate(self.names)
+        return {name: np.stack([self._mean(row, k) for row in rows]) for k, name in called}
 
     def _mean(self, row: int, k: int) -> Array:
         """Average the last poses (7,) of an object, where they are enough."""

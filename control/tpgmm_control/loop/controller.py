@@ -74,7 +74,6 @@ from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.servo import Flags
 from tpgmm_control.sensing.trust import Trust
 from tpgmm_control.sensing.wrenches import Wrenches
-from tpgmm_torch.checks.situations import START
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError
@@ -82,7 +81,7 @@ from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.holding import Holding
-from tpgmm_torch.skills.situations import complete_frames, report_start
+from tpgmm_torch.skills.situations import START, complete_frames, report_start
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]

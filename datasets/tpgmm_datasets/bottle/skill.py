@@ -38,6 +38,7 @@ from tpgmm_torch.operators import Operator
 
 __all__ = ["BottleShaking", "bottle_operators", "upper_body"]
 
+Point = Sequence[float]
 #: What LeRobot data sets of the skill call it.
 TASK = "shake the bottle"
 HANDS = ("l_hand", "r_hand")
@@ -352,11 +353,7 @@ def pose_error(pose: Frame, target: Frame) -> tuple[Tensor, Tensor]:
 
 
 def upright(
-    rng: np.random.Generator,
-    lowest: Sequence[float],
-    highest: Sequence[float],
-    yaw: float,
-    n: int,
+    rng: np.random.Generator, lowest: Point, highest: Point, yaw: float, n: int
 ) -> Frame:
     """Draw ``n`` poses in a box [m], turned about the vertical by up to ``yaw`` [deg]."""
     position = rng.uniform(lowest, highest, (n, 3))
@@ -365,7 +362,7 @@ def upright(
     return Frame(position, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=1))
 
 
-def place_hand(frame: Frame, point: tuple[float, ...]) -> Frame:
+def place_hand(frame: Frame, point: Point) -> Frame:
     """Place a hand at a point of a frame, turned for the grasp."""
     turn = torch.tensor(GRASP_TURN, dtype=torch.float64).expand_as(frame.orientation)
     where = torch.tensor(point, dtype=torch.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -11,9 +11,9 @@ import torch
 
 from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
 from tpgmm_datasets.checks.outliers import outliers
-from tpgmm_datasets.checks.places import report_at
+from tpgmm_datasets.checks.places import Findings, report_at
 from tpgmm_datasets.checks.poses import pose_findings
-from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_datasets.checks.recording_summaries import Recordings, RecordingSummary
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, Report, shorten_list
 from tpgmm_torch.checks.training import in_order, unit_findings
@@ -44,10 +44,9 @@ BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode
 
 
 def check(
-    demonstrations: Iterable[Demonstration],
-    robot: Kinematics | None = None,
+    demonstrations: Iterable[Demonstration], robot: Kinematics | None = None,
     raw: Collection[str] = (),
-) -> Report:
+) -> Report:  # fmt: skip
     """Check whether recordings can be what they are taken for; nothing is changed.
 
     Checked are units, limits of position and speed, the order of unnamed joints, wraps, jumps,
@@ -91,9 +90,7 @@ def check(
 
 
 def check_summaries(
-    episodes: Sequence[RecordingSummary],
-    robot: Kinematics | None = None,
-    raw: Collection[str] = (),
+    episodes: Recordings, robot: Kinematics | None = None, raw: Collection[str] = ()
 ) -> Report:
     """Make the report of :func:`tpgmm_datasets.check` on summaries of recordings.
 
@@ -121,7 +118,7 @@ def check_summaries(
     return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
 
 
-def _check_time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_time(episodes: Recordings) -> Findings:
     """Find steps, gaps and durations unlike the others."""
     steps = np.array([episode.step for episode in episodes])
     usual = float(np.median(steps))
@@ -144,11 +141,11 @@ def _check_time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     yield from report_at("durations", message, remedy, places, most)
 
 
-def _list_events(episodes: Sequence[RecordingSummary]) -> list[str]:
+def _list_events(episodes: Recordings) -> list[str]:
     return list(dict.fromkeys(name for one in episodes for name in one.events))
 
 
-def _check_phases(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_phases(episodes: Recordings) -> Findings:
     """Find events that are missing, or at another phase than usual."""
     names = _list_events(episodes)
     places: list[str] = []
@@ -157,10 +154,9 @@ def _check_phases(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         phases = {i: one.events[name] for i, one in enumerate(episodes) if name in one.events}
         usual = float(np.median(list(phases.values())))
         odd = [[*phases][k] for k in outliers([*phases.values()], floor=SAME_PHASE)]
+        at = f"usually at {usual:.0%}"
         for i in sorted(odd):
-            places.append(
-                f"{name!r} at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}"
-            )
+            places.append(f"{name!r} at {phases[i]:.0%} of demonstration {i}, {at}")
         lost = sorted({*range(len(episodes))} - phases.keys())
         if lost and len(lost) < len(phases):
             places.append(f"{name!r} missing in {shorten_list([*map(str, lost)])}")
@@ -171,7 +167,7 @@ def _check_phases(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
 
 
-def _check_order(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_order(episodes: Recordings) -> Findings:
     """Find pairs of events that are in another order than usual."""
     for first, second in combinations(_list_events(episodes), 2):
         pair = {first, second}
@@ -186,7 +182,7 @@ def _check_order(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
             yield Finding("events", message + these, BY_HAND, order, tuple(ahead))
 
 
-def _check_copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_copies(episodes: Recordings) -> Findings:
     first: dict[str, int] = {}
     copies = [
         (f"demonstration {i} is a copy of {first[one.digest]}", i, "")
@@ -197,33 +193,28 @@ def _check_copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     yield from report_at("copies", "some were recorded once and counted twice:", remedy, copies)
 
 
-def _check_paths(
-    episodes: Sequence[RecordingSummary], robot: Kinematics | None
-) -> Iterator[Finding]:
+def _check_paths(episodes: Recordings, robot: Kinematics | None) -> Findings:
     """Find episodes whose path is far from the median path, or runs backwards along it."""
     if len(episodes) < FEWEST_REVERSED:
         return
     paths = _stack_paths(episodes, robot)
     paths /= np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
     median = np.median(paths, axis=0)
-    along, turned = (
-        _cosines(np.diff(p, axis=1), np.diff(median, axis=0)) for p in (paths, paths[:, ::-1])
-    )
+    steps = np.diff(median, axis=0)
+    along, turned = (_cosines(np.diff(p, axis=1), steps) for p in (paths, paths[:, ::-1]))
     against = (turned > np.maximum(ALONG, along + BACKWARDS)) & (np.median(along) > ALONG)
-    reverse = np.flatnonzero(against).tolist()
-    places = [
-        (f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})", i, "") for i in reverse
-    ]
+    back = np.flatnonzero(against).tolist()
+    places = [(f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})", i, "") for i in back]
     message = "paths go along the median path if they run backwards:"
     remedy = "Are they stored in reverse, or another skill? Leave them out"
     yield from report_at("episodes", message, remedy, places)
     if len(episodes) >= FEWEST_PATHS:
-        yield from _check_distances(paths - median, episodes[0].joint_names, reverse)
+        yield from _check_distances(paths - median, episodes[0].joint_names, back)
 
 
 def _check_distances(
     differences: Array, joint_names: Sequence[str] | None, known: Collection[int]
-) -> Iterator[Finding]:
+) -> Findings:
     """Find paths far from the median path, of which the differences (E, P, n_joints) are."""
     squares = differences**2
     distances = np.sqrt(squares.mean(axis=(1, 2)))
@@ -248,7 +239,7 @@ def _cosines(steps: Array, usual: Array) -> Array:
     return cosines
 
 
-def _stack_paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:
+def _stack_paths(episodes: Recordings, robot: Kinematics | None) -> Array:
     """Stack paths (E, P, n_joints), quaternions among them on the side of their mean."""
     paths = np.stack([episode.path for episode in episodes])
     for columns in quaternion_columns(episodes[0].joint_names, robot):

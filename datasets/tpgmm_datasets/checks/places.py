@@ -5,14 +5,14 @@ from math import nan
 
 from tpgmm_torch.checks.report import Finding, shorten_list
 
+Findings = Iterator[Finding]
+#: What is said of it, its demonstration, and its joint or frame, empty if it has none.
+Place = tuple[str, int, str]
+
 
 def report_at(
-    check: str,
-    message: str,
-    remedy: str,
-    places: Sequence[tuple[str, int, str]],
-    value: float = nan,
-) -> Iterator[Finding]:
+    check: str, message: str, remedy: str, places: Sequence[Place], value: float = nan
+) -> Findings:
     """Report some places as one finding, if there are any.
 
     Parameters
@@ -20,13 +20,12 @@ def report_at(
     check, message, remedy : str
         As of :class:`~tpgmm_torch.checks.report.Finding`; the message goes on with the places.
     places : sequence of (str, int, str)
-        What is said of each, its demonstration, and its joint or frame, empty if it has none.
+        As :data:`Place` says.
     value : float, optional
         As of the finding.
     """
     if places:
-        texts, episodes, names = (
-            tuple(dict.fromkeys(part)) for part in zip(*places, strict=True)
-        )
+        parts = zip(*places, strict=True)
+        texts, episodes, names = (tuple(dict.fromkeys(part)) for part in parts)
         about = tuple(filter(None, names))
         yield Finding(check, f"{message} {shorten_list(texts)}", remedy, about, episodes, value)

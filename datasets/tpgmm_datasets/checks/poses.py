@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection
 
 import numpy as np
 import torch
 
 from tpgmm_datasets.checks.outliers import set_apart
-from tpgmm_datasets.checks.places import report_at
-from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_datasets.checks.places import Findings, report_at
+from tpgmm_datasets.checks.recording_summaries import Recordings
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding
 from tpgmm_torch.data.arrays import Array, as_array
@@ -27,10 +27,8 @@ MOST_COMPARED = 500
 
 
 def pose_findings(
-    episodes: Sequence[RecordingSummary],
-    other_units: Collection[str],
-    robot: Kinematics | None = None,
-) -> Iterator[Finding]:
+    episodes: Recordings, other_units: Collection[str], robot: Kinematics | None = None
+) -> Findings:
     """Find other quaternion orders, lost trackers, jumps, and places out of reach or unusual.
 
     Parameters
@@ -52,7 +50,7 @@ def pose_findings(
         yield from _check_quaternion_order(name, episodes)
 
 
-def _check_places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_places(name: str, episodes: Recordings) -> Findings:
     """Find episodes in which the object is where it never is otherwise."""
     first = np.stack([episode.frames[name].position for episode in episodes])
     usual = np.median(first, axis=0)
@@ -71,7 +69,7 @@ def _check_places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[F
         yield from report_at("frames", message, remedy, places)
 
 
-def _check_reach(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
+def _check_reach(episodes: Recordings, robot: Robot) -> Findings:
     """Find objects that no hand comes near, and the base in whose frame one would."""
     gaps = _measure_gaps(episodes, robot)
     best = min(gaps, key=lambda base: gaps[base])
@@ -90,7 +88,7 @@ def _check_reach(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator
     yield Finding("distance", message, remedy, (*episodes[0].frames,), value=gaps[""])
 
 
-def _measure_gaps(episodes: Sequence[RecordingSummary], robot: Robot) -> dict[str, float]:
+def _measure_gaps(episodes: Recordings, robot: Robot) -> dict[str, float]:
     """Measure how near hands come to objects [m], were poses in the frame of each base."""
     paths = np.stack([episode.path for episode in episodes])
     hands = as_array(robot.state(paths).positions)[:, :, None]
@@ -105,7 +103,7 @@ def _measure_gaps(episodes: Sequence[RecordingSummary], robot: Robot) -> dict[st
     return gaps
 
 
-def _check_angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_angles(name: str, episodes: Recordings) -> Findings:
     """Find episodes in which the object is turned as it never is otherwise."""
     turns = np.stack([episode.frames[name].orientation for episode in episodes])
     some = turns[:MOST_COMPARED]
@@ -120,7 +118,7 @@ def _check_angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[F
         yield from report_at("frames", message, remedy, places)
 
 
-def _check_jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+def _check_jumps(name: str, episodes: Recordings) -> Findings:
     leaps = [(*episode.leaps[name], episode.step) for episode in episodes]
     places = [
         (f"by {size:.3g} m at {at:.4g} s of demonstration {i}", i, name)
@@ -131,9 +129,7 @@ def _check_jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Fi
     yield from report_at("frames", f"frame {name!r} jumps", remedy, places)
 
 
-def _check_quaternion_order(
-    name: str, episodes: Sequence[RecordingSummary]
-) -> Iterator[Finding]:
+def _check_quaternion_order(name: str, episodes: Recordings) -> Findings:
     """Find half-turns that would be turns about the vertical, were w the last number."""
     given = np.concatenate([episode.turns[name] for episode in episodes])
     upright, spread = _upright(given)

@@ -28,6 +28,7 @@ FEW_VALUES = 5
 
 #: Joint, instant [s] or value, and size [rad or m] of what happened there.
 JointEvent = tuple[int, float, float]
+Events = tuple[JointEvent, ...]
 
 
 @dataclass(frozen=True)
@@ -90,14 +91,15 @@ class RecordingSummary(EpisodeSummary):
             plateaus=_find_plateaus(joints, steps),
             still=_measure_still(steps),
             turns={
-                name: as_array(
-                    frame.orientation[phases] if frame.batch_shape else frame.orientation[None]
-                )
+                name: as_array(frame.orientation[phases if frame.batch_shape else None])
                 for name, frame in poses.items()
             },
             leaps={name: _find_leap(frame, time) for name, frame in poses.items()},
             digest=hashlib.sha256(joints.tobytes()).hexdigest(),
         )
+
+
+Recordings = Sequence[RecordingSummary]
 
 
 def _find_leap(frame: Frame, time: Array) -> tuple[float, float, float]:
@@ -108,17 +110,14 @@ def _find_leap(frame: Frame, time: Array) -> tuple[float, float, float]:
     return float(steps[at]), float(np.quantile(steps, 0.98)), float(time[at + 1])
 
 
-def _find_jumps(
-    time: Array, joints: Array, steps: Array
-) -> tuple[tuple[JointEvent, ...], tuple[JointEvent, ...]]:
+def _find_jumps(time: Array, joints: Array, steps: Array) -> tuple[Events, Events]:
     """Find steps by a whole turn, and steps that are like no other of their joint."""
     if len(steps) < 3:
         return (), ()
     sizes = np.abs(steps)
     turn = (np.abs(sizes - 2 * np.pi) < 0.4) & (sizes > 5 * np.median(sizes, axis=0))
-    least = np.stack(
-        (JUMP * np.quantile(sizes, 0.98, axis=0), JUMP_SHARE * np.ptp(joints, axis=0))
-    )
+    usual = np.quantile(sizes, 0.98, axis=0)
+    least = np.stack((JUMP * usual, JUMP_SHARE * np.ptp(joints, axis=0)))
     large = (sizes > least.max(axis=0, initial=SMALLEST_JUMP)) & ~turn & ~_is_switched(joints)
 
     def found(mask: NDArray[np.bool_]) -> Iterable[JointEvent]:

@@ -15,15 +15,10 @@ from tpgmm_datasets.conversion.poses import FramePose, LinkPose, MeasuredPoses
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.events import Detector, parse_event, usual_event
+from tpgmm_datasets.lerobot import stored_signals as signals
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout
-from tpgmm_datasets.lerobot.stored_signals import (
-    event_features,
-    flagged_events,
-    stored_wrenches,
-    wrench_features,
-)
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -34,6 +29,7 @@ from tpgmm_torch.training.hold_detection import holding_as_in
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]
+Sources = Mapping[str, Pose]
 EventSource = str | Detector | Callable[[Demonstration], float]
 
 
@@ -72,7 +68,7 @@ def _frame_source(
 
 def event_sources(
     events: Mapping[str, EventSource] | None,
-    frames: Mapping[str, Pose],
+    frames: Sources,
     stored: Collection[str],
     names: Sequence[str] | None,
 ) -> dict[str, Detector | Callable[[Demonstration], float]]:
@@ -123,9 +119,7 @@ def _find_usual_event(frame: str, pose: LinkPose, names: Sequence[str]) -> Detec
         raise DatasetError(message) from error
 
 
-def stored_frames(
-    layout: Layout, sources: Mapping[str, Pose], rows: EpisodeRows
-) -> dict[str, Frame]:
+def stored_frames(layout: Layout, sources: Sources, rows: EpisodeRows) -> dict[str, Frame]:
     """Read the frames of an episode that are not at links."""
     frames, where = dict[str, Frame](), rows.episode.where
     for name, source in sources.items():
@@ -188,11 +182,13 @@ class Assembly:
     @property
     def features(self) -> list[Feature]:
         """Features that have to be read."""
-        poses = [one for one in self.frames.values() if isinstance(one, FramePose)]
-        objects = map(self.layout.feature, dict.fromkeys(pose.feature for pose in poses))
+        layout, frames = self.layout, self.frames.values()
+        poses = [one for one in frames if isinstance(one, FramePose)]
+        objects = map(layout.feature, dict.fromkeys(pose.feature for pose in poses))
         several = self.joints, self.measured_joints, self.commanded_joints
         joints = [one.feature for one in several if one]
-        return [*joints, *objects, *event_features(self.layout), *wrench_features(self.layout)]
+        flags, wrenches = signals.event_features(layout), signals.wrench_features(layout)
+        return [*joints, *objects, *flags, *wrenches]
 
     @property
     def measured_joints(self) -> JointColumns | None:
@@ -238,8 +234,8 @@ class Assembly:
             torch.from_numpy(joints),
             stored_frames(self.layout, self.frames, rows),
             self.joints.names,
-            flagged_events(rows),
-            wrenches=stored_wrenches(rows),
+            signals.flagged_events(rows),
+            wrenches=signals.stored_wrenches(rows),
             commands=self._commands(rows, joints),
         )
         if measured is not None:

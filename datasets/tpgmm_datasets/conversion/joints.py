@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from tpgmm_datasets.units import Scale, Unit, Units, add_offsets, as_scale, conv
 from tpgmm_torch.checks.report import Finding
 
 Names = Mapping[str, str] | Sequence[str]
+Labels = tuple[str, ...] | None
 
 #: Where the joints are, in order of preference.
 MEASURED = ("observation.state", "observation.states", "state", "observation.qpos")
@@ -46,9 +47,7 @@ class JointColumns:
     units: tuple[Unit, ...]
 
     @classmethod
-    def choose(
-        cls, feature: Feature, names: Names | None, units: Units, robot: Any
-    ) -> JointColumns:
+    def choose(cls, feature: Feature, names: Names | None, units: Units, robot: Any) -> Self:
         """Match the values of a feature with what the caller says and with the robot.
 
         Raises
@@ -57,7 +56,7 @@ class JointColumns:
             If a name or unit does not fit.
         """
         final = names_of(feature, names, robot)
-        return cls(feature, final, _choose_units(feature, final, units, robot))
+        return cls(feature, final, tuple(_choose_units(feature, final, units, robot)))
 
     @property
     def scales(self) -> list[Scale]:
@@ -163,9 +162,7 @@ def _rename_values(feature: Feature, renamed: Mapping[str, str]) -> tuple[str, .
     return feature.names and tuple(renamed.get(name, name) for name in feature.names)
 
 
-def _match_robot(
-    feature: Feature, names: tuple[str, ...] | None, robot: Any
-) -> tuple[str, ...]:
+def _match_robot(feature: Feature, names: Labels, robot: Any) -> tuple[str, ...]:
     if names is None and feature.width == len(robot.joint_names) == 1:
         names = tuple(robot.joint_names)
     if names is None:
@@ -176,11 +173,9 @@ def _match_robot(
     return tuple(matched.get(name, name) for name in names)
 
 
-def _choose_units(
-    feature: Feature, final: Sequence[str] | None, units: Units, robot: Any
-) -> tuple[Unit, ...]:
+def _choose_units(feature: Feature, named: Labels, units: Units, robot: Any) -> list[Unit]:
     """Choose units: given ones, by the data set's name or the robot's, before declared ones."""
-    final = final or feature.labels
+    final = named or feature.labels
     stored = feature.names or final
     declared = feature.units or ("auto",) * feature.width
     chosen = units_of(units, stored, final, robot, feature.key)
@@ -195,7 +190,7 @@ def _choose_units(
     if differing:
         differ = f"the set declares {', '.join(differing)}; what was given counts"
         warnings.warn(f"column {feature.key!r}: {differ}", DatasetWarning, stacklevel=2)
-    return tuple(resolved)
+    return resolved
 
 
 def _differ(given: Unit, declared: str, column: str) -> bool:

@@ -48,6 +48,9 @@ REACH = 1.0
 #: Poses over more than so many times the length of an episode are on another clock.
 LONGEST = 10.0
 
+#: Of episodes.
+Indices = Collection[int]
+
 
 @dataclass(frozen=True)
 class FramePose:
@@ -89,9 +92,7 @@ class FramePose:
 
     def __post_init__(self) -> None:
         if self.rotation not in ROTATIONS:
-            raise DatasetError(
-                f"rotation {self.rotation!r} is unknown; there are {[*ROTATIONS]}"
-            )
+            raise DatasetError(f"rotation {self.rotation!r} is not known; {[*ROTATIONS]} are")
 
     def select(self, name: str, feature: Feature) -> list[int]:
         """Select the positions of the values that make frame ``name``, checked for number."""
@@ -185,9 +186,7 @@ class MeasuredPoses:
     feature: str = "the frames that were given"
 
     @classmethod
-    def read(
-        cls, name: str, path: str | Path, wanted: Sequence[int], known: Collection[int]
-    ) -> Self:
+    def read(cls, name: str, path: str | Path, wanted: Indices, known: Indices) -> Self:
         """Read a table (.csv or .parquet) with a row for each episode, or for each instant.
 
         Its columns are ``episode`` (the index in the set), ``x``, ``y``, ``z`` [m], and the
@@ -240,9 +239,7 @@ class MeasuredPoses:
         return cls(poses, times, str(path))
 
     @classmethod
-    def take(
-        cls, name: str, frames: Any, wanted: Sequence[int], known: Collection[int]
-    ) -> Self:
+    def take(cls, name: str, frames: Any, wanted: Indices, known: Indices) -> Self:
         """Take frames by episode, or one for each that is read; the rest as :meth:`read`.
 
         Raises

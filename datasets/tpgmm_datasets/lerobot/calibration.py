@@ -86,9 +86,7 @@ def _scale(name: str, motor: Any, file: str | Path) -> Scale:
     fields = [motor.get(field) for field in FIELDS] if isinstance(motor, dict) else []
     whole = [value for value in fields if type(value) is int]
     if len(whole) < len(FIELDS) or whole[1] >= whole[2]:
-        message = (
-            f"motor {name!r} needs whole numbers {list(FIELDS)} and a range, got {motor!r}"
-        )
+        message = f"motor {name!r} needs whole numbers {[*FIELDS]} and a range, got {motor!r}"
         raise DatasetError(message, file=file)
     drive_mode, low, high = whole
     stored = (0.0, 100.0) if "gripper" in name else (-100.0, 100.0)

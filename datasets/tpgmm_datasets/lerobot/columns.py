@@ -35,7 +35,10 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import POSE_PARTS
 
 Array = np.ndarray[Any, Any]
-Features = dict[str, dict[str, Any]]
+#: A column as ``info.json`` declares it; all of them; and the values of columns.
+Entry = dict[str, Any]
+Features = dict[str, Entry]
+Columns = dict[str, Array]
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 EVENT, WRENCH = "event.", "observation.wrench."
@@ -78,11 +81,9 @@ def features_of(
     return features
 
 
-def _declare_joints(
-    demonstration: Demonstration, dtype: str, units: Mapping[str, str]
-) -> dict[str, Any]:
+def _declare_joints(shown: Demonstration, dtype: str, units: Mapping[str, str]) -> Entry:
     """Declare the joints, in radians where no unit is given."""
-    width, names = demonstration.n_joints, demonstration.joint_names
+    width, names = shown.n_joints, shown.joint_names
     if width == 0:
         raise DatasetError("demonstrations without joints cannot be stored: LeRobot needs them")
     for name, unit in units.items():
@@ -94,9 +95,7 @@ def _declare_joints(
     return _vector(dtype, width, names, with_pose_units(names, listed))
 
 
-def with_frames(
-    old: Feature | None, frames: Sequence[str], dtype: str = "float32"
-) -> dict[str, Any]:
+def with_frames(old: Feature | None, frames: Sequence[str], dtype: str = "float32") -> Entry:
     """Declare ``observation.environment_state``, with frames behind the old values.
 
     Raises
@@ -115,9 +114,7 @@ def with_frames(
     return _vector(dtype, len(names), names, units)
 
 
-def _vector(
-    dtype: str, width: int, names: Sequence[str] | None, units: Sequence[str]
-) -> dict[str, Any]:
+def _vector(dtype: str, width: int, names: Sequence[str] | None, units: Sequence[str]) -> Entry:
     names = None if names is None else list(names)
     return {"dtype": dtype, "shape": [width], "names": names, "info": {"units": list(units)}}
 
@@ -168,9 +165,7 @@ def _check_grid(demonstration: Demonstration, number: int, fps: float) -> Array:
     return grid
 
 
-def action_column(
-    commanded: Demonstration, number: int, features: Mapping[str, Any]
-) -> dict[str, Array]:
+def action_column(commanded: Demonstration, number: int, features: Features) -> Columns:
     """Return the column ``action``, as the joints of ``commanded``."""
     feature = features[ACTION]
     if commanded.n_joints != feature["shape"][0]:

@@ -82,7 +82,7 @@ class Relaxed:
 
 
 def read_episodes(
-    layout: Layout, wanted: Sequence[Episode], features: Sequence[Feature], policy: Policy
+    layout: Layout, wanted: Sequence[Episode], features: list[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
     """Yield the wanted episodes in order of their index, file by file at bounded memory.
 
@@ -99,7 +99,7 @@ def read_episodes(
 
 
 def _read_file(
-    layout: Layout, episodes: Sequence[Episode], features: Sequence[Feature], policy: Policy
+    layout: Layout, episodes: Sequence[Episode], features: list[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
     file, needed = episodes[0].file, ["episode_index", *(feature.key for feature in features)]
     expected = {episode.index: episode for episode in episodes}
@@ -170,11 +170,7 @@ def _compare_declarations(
 
 
 def _read_rows(
-    layout: Layout,
-    episode: Episode,
-    table: pa.Table,
-    features: Sequence[Feature],
-    policy: Policy,
+    layout: Layout, episode: Episode, table: pa.Table, features: list[Feature], policy: Policy
 ) -> Iterator[EpisodeRows]:
     """Yield the checked arrays of an episode; none if a problem of it is let pass."""
     problems = list(_check_rows(layout, episode, table))

@@ -292,9 +292,7 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield place, _object(text, place)
 
 
-def _episode(
-    info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
-) -> Episode:
+def _episode(info: Mapping[str, Any], place: str, row: dict[str, Any], modern: bool) -> Episode:
     _check_numbers(row, ROW_NUMBERS if modern else ROW_NUMBERS[:2], place)
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
@@ -319,11 +317,7 @@ def _check_numbers(row: Mapping[str, Any], names: Sequence[str], place: str) -> 
 
 
 def episode_file(
-    info: Mapping[str, Any],
-    template: str,
-    index: int,
-    place: tuple[int, int] | None,
-    **texts: str,
+    info: Mapping[str, Any], template: str, index: int, place: Any, **texts: str
 ) -> Path:
     """Find the file of an episode, relative to the root, by a template in ``info.json``.
 
@@ -408,7 +402,5 @@ def _contradictions(
     listed = {episode.file for episode in episodes}
     for path in chunked_files(root / "data"):
         if path.relative_to(root) not in listed:
-            message = (
-                "no episode lies in this file: a left-over of another or a broken recording"
-            )
+            message = "no episode lies in this file: left over of another or a broken recording"
             yield DatasetError(message, check="metadata", file=path.relative_to(root))

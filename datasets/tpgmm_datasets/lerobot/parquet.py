@@ -21,6 +21,7 @@ BATCH_ROWS = 1 << 16
 #: memory would fill, however small the file is.
 MOST_READ = 2_000_000
 MOST_IN_EPISODE = 20_000_000
+OVERFULL = (OverflowError, MemoryError)
 
 
 @contextmanager
@@ -29,14 +30,7 @@ def _name_errors(file: Path) -> Iterator[None]:
         yield
     # what pyarrow raises on corrupted bytes is not one class: text that is no UTF-8, sizes
     # that overflow, columns that vanish
-    except (
-        pa.ArrowException,
-        OSError,
-        ValueError,
-        KeyError,
-        OverflowError,
-        MemoryError,
-    ) as error:
+    except (pa.ArrowException, OSError, ValueError, KeyError, *OVERFULL) as error:
         if isinstance(error, DatasetError):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
@@ -70,9 +64,7 @@ def open_parquet(
     for column in (*columns, *(name for name in optional if name in present)):
         if present.count(column) != 1:
             there = [name for name in present if not name.startswith("stats/")]
-            message = (
-                f"the file has {present.count(column)} columns of that name; it has {there}"
-            )
+            message = f"it has {present.count(column)} columns of that name; it has {there}"
             raise DatasetError(message, file=file, column=column)
     return parquet
 

@@ -89,9 +89,7 @@ def stated_range(root: Path, key: str, width: int) -> Array | None:
         else:
             lines = (root / "meta/episodes_stats.jsonl").read_text().splitlines()
             stated = [json.loads(line)["stats"] for line in lines]
-        low, high = (
-            [_numbers(one[key][end], width) for one in stated] for end in ("min", "max")
-        )
+        low, high = ([_numbers(s[key][end], width) for s in stated] for end in ("min", "max"))
         found: Array = np.stack((np.min(low, axis=0), np.max(high, axis=0)))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

@@ -98,9 +98,7 @@ class AlohaStateEnv(StateEnv):
         yaw_range: float = math.pi / 4,
         track: bool = False,
         stop_at_success: bool = True,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
+        **rendering: Any,
     ) -> None:
         if task not in OBJECTS:
             raise UnknownNameError("task", task, "aloha_state", OBJECTS)
@@ -125,17 +123,13 @@ class AlohaStateEnv(StateEnv):
                 "episode_length has to be at least 1 and yaw_range between 0 and pi, got "
                 f"{steps!r} and {yaw_range!r}"
             )
-        super().__init__(fps, steps, CAMERA, render_mode, (render_width, render_height))
+        super().__init__(fps, steps, CAMERA, **rendering)
         self.yaw_range, self.track, self.stop_at_success = yaw_range, track, stop_at_success
         self._substeps = rate // fps
         self.action_space = _actions(self._physics.model)
+        sizes = {"agent_pos": len(JOINTS), "environment_state": 7 * len(OBJECTS[task])}
         self.observation_space = gym.spaces.Dict(
-            {
-                "agent_pos": gym.spaces.Box(-1000, 1000, (len(JOINTS),), np.float64),
-                "environment_state": gym.spaces.Box(
-                    -1000, 1000, (7 * len(OBJECTS[task]),), np.float64
-                ),
-            }
+            {k: gym.spaces.Box(-1000, 1000, (n,), np.float64) for k, n in sizes.items()}
         )
 
     def reset(

@@ -11,16 +11,15 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.carry_and_put import SLIDE, TASK, CarryAndPut, slide
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import PUT_FIGURES, Closing, successful
-from lerobot_env_bimanual.bottle.scene import CARRIERS, Snapshot, TrayScene
+from lerobot_env_bimanual.bottle.scene import CARRIERS, TrayScene
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.skill import FOOT
-from tpgmm_torch import Demonstration, Frame, Situation
+from tpgmm_torch import Frame
 
 __all__ = ["CarryAndPutEnv"]
 
@@ -33,8 +32,6 @@ LIFTED = 0.02
 PUT = 0.01
 #: A bottle that leans more than this does not stand [deg].
 UPRIGHT = 5.0
-#: Time steps per second of the path on which a robot is put [1/s].
-PATH_RATE = 25.0
 
 
 @functools.cache
@@ -121,15 +118,15 @@ class CarryAndPutEnv(BottleEnv):
             slide=task.slides(1, rng)[0],
             misperception=np.append(start.misperception, rng.standard_normal(6)),
         ).given(options, task.robot)
-        self._scene.reset(start.poses["bottle"], start.joints, start.mass)
-        self._scene.put_tray(start.poses["tray"])
         self._closed: float | None = None  # when the hands began to close
         self._opening, self._lifted, self._put = Closing(reach=PUT), False, False
         return start
 
     def _close(self, at_once: bool) -> None:
         super()._close(at_once)
-        self._scene.let_go()  # not yet; but from now on the palms do not push it
+        self._change_hands(
+            self._scene.let_go
+        )  # not yet; but from now on the palms do not push it
         self._closed = self._free - (SLIDE[1] if at_once else 0.0)
         self._let_slide()
 
@@ -139,10 +136,10 @@ class CarryAndPutEnv(BottleEnv):
         done = min((self._free - self._closed) / SLIDE[1] + 1e-9, 1.0)
         stood = Frame(*np.split(self._contact[1], [3]))
         pose = stood.compose(slide(done * self._start.slide))
-        self._scene.put_bottle(torch.cat((pose.position, pose.orientation)).numpy())
+        self._scene.put("bottle", torch.cat((pose.position, pose.orientation)).numpy())
         if done == 1.0:
             self._closed = None
-            self._scene.hold()
+            self._change_hands(self._scene.hold)
 
     def _use_hands(self, stopped: bool) -> None:
         super()._use_hands(stopped)
@@ -155,33 +152,16 @@ class CarryAndPutEnv(BottleEnv):
             self._lifted |= height > LIFTED
             if self._lifted and self._opening.update(self._free, max(height, 0.0)):
                 self._put = True
-                self._scene.let_go()
+                self._change_hands(self._scene.let_go)
 
-    def _restore(self, before: Snapshot) -> None:
+    def _restore(self, before: Any) -> None:
         super()._restore(before)
         self._opening, self._closed = Closing(reach=PUT), None
         self._lifted &= self._grasp_step is not None
         self._put &= not self._scene.held and self._lifted
 
-    def _nominal(self) -> Demonstration:
-        start, standing = self._start, self._standing()
-        return _path(*map(tuple, (start.joints, standing, start.poses["tray"], start.slide)))
+    def _generator(self) -> CarryAndPut:
+        return carrying()
 
-    def _stands_usually(self, bottle: Array) -> bool:
-        return carrying().usual(Frame(bottle[:3], bottle[3:]))
-
-
-@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
-def _path(
-    joints: tuple[float, ...],
-    bottle: tuple[float, ...],
-    tray: tuple[float, ...],
-    slide: tuple[float, ...],
-) -> Demonstration:
-    frames = {
-        name: Frame(pose[:3], pose[3:]) for name, pose in (("bottle", bottle), ("tray", tray))
-    }
-    situation = Situation(torch.tensor(joints), frames)
-    generator = CarryAndPut(rate=PATH_RATE, robot=skill().robot)
-    [path] = generator.nominal([situation], np.array([slide]))
-    return path
+    def _slides(self) -> tuple[float, ...]:
+        return tuple(self._start.slide)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,14 +15,18 @@ import torch
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.measures import Closing
-from lerobot_env_bimanual.bottle.scene import CARRIERS, BottleScene, Snapshot
+from lerobot_env_bimanual.bottle.scene import CARRIERS, HOLDS, BottleScene
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.disturbances import Course, displace_pose
+from lerobot_env_bimanual.disturbances import Course
+from lerobot_env_bimanual.robot_scene import Hold
 from lerobot_env_bimanual.start import Start
-from tpgmm_torch import Demonstration, Frame
+from tpgmm_datasets.bottle.skill import FOOT, BottleSkill
+from tpgmm_torch import Demonstration, Frame, Situation
 
 #: The grip gives way at this force [N], without dynamics at this displacement [m].
 GRIP_FORCE, GRIP_SLIP = 100.0, 0.03
+#: Time steps per second of the path on which a robot is put [1/s].
+PATH_RATE = 25.0
 
 
 class BottleEnv(ControlledEnv):
@@ -47,18 +53,29 @@ class BottleEnv(ControlledEnv):
         """Draw an episode, and set the scene."""
 
     @abstractmethod
+    def _generator(self) -> BottleSkill:
+        """Return the generator of the demonstrations."""
+
+    def _slides(self) -> tuple[float, ...]:
+        """Return how the bottle slides in the hands [m, rad], if it does."""
+        return ()
+
     def _nominal(self) -> Demonstration:
         """Return the generator's path for this start posture and the objects where they are.
 
         Its event ``"grasp"`` says from when on the hands hold the bottle.
         """
+        poses = {**self._start.poses, "bottle": self._standing()}
+        frames = tuple((name, tuple(pose)) for name, pose in poses.items())
+        return _path(self._generator(), tuple(self._start.joints), frames, self._slides())
 
-    @abstractmethod
-    def _stands_usually(self, bottle: Array) -> bool:
-        """Check whether the task is meant for a bottle there."""
+    def _stands_usually(self, pose: Array) -> bool:
+        return self._generator().usual(Frame(pose[:3], pose[3:]))
 
     def _begin(self, options: Mapping[str, Any]) -> Start:
         start = self._draw(options)
+        table = float(start.poses["bottle"][2]) - FOOT
+        self._scene.reset(start.poses, start.joints, table, start.mass)
         self._closing = Closing()
         self._nearest, self._contact = math.inf, (start.joints, start.poses["bottle"])
         # when the hands closed, in steps that count; joints and height at each of these
@@ -89,22 +106,30 @@ class BottleEnv(ControlledEnv):
         scene = self._scene
         if self._grasp_step is None:
             if not stopped:
-                gap = scene.gap()
+                gap = max(map(scene.gap, HOLDS))
                 closes = self._closing.update(self._free, gap)
                 if closes or gap < self._nearest:
                     self._nearest, self._contact = gap, (scene.joints, scene.bottle)
                 if closes:
                     self._close(at_once=False)
         elif scene.held:
-            kinematic = self.mode == "kinematic"
-            if scene.slip() > GRIP_SLIP if kinematic else scene.pull() > GRIP_FORCE:
-                scene.let_go()
+            if self.mode == "kinematic":
+                lost = scene.slip() > GRIP_SLIP
+            else:
+                lost = max(map(scene.pull, HOLDS)) > GRIP_FORCE
+            if lost:
+                self._change_hands(scene.let_go)
 
     def _close(self, at_once: bool) -> None:
         """Take hold of the bottle, without what happens meanwhile if ``at_once``."""
         self._grasp_step = self._counted
         self._contact = self._scene.joints, self._scene.bottle
-        self._scene.hold()
+        self._change_hands(self._scene.hold)
+
+    def _change_hands(self, change: Callable[[Hold], None]) -> None:
+        """Close or open both hands."""
+        for hold in HOLDS:
+            change(hold)
 
     def _since_grasp(self) -> Array:
         """Joints [rad] and the bottle's height [m], (T, 18), at the rate of the control."""
@@ -115,17 +140,11 @@ class BottleEnv(ControlledEnv):
         grid = np.arange(times[0], times[-1], 1 / self.fps)
         return np.stack([np.interp(grid, times, column) for column in motion.T], axis=1)
 
-    def _usual(self, step: Array) -> bool:
-        return self._stands_usually(displace_pose(self._start.poses["bottle"], step))
-
-    def _displace(self, step: Array) -> None:
-        if self._grasp_step is None:
-            self._scene.put_bottle(displace_pose(self._start.poses["bottle"], step))
-
-    def _restore(self, before: Snapshot) -> None:
+    def _restore(self, before: Any) -> None:
         super()._restore(before)
-        if not before.held:
+        if not self._scene.held:
             self._grasp_step, self._nearest, self._closing = None, math.inf, Closing()
+            self._scene.taken.clear()
 
     def _put_on_path(self, instant: float) -> None:
         """Continue the task at an instant of its nominal path, at rest."""
@@ -153,3 +172,17 @@ def _at(path: Demonstration, instant: float) -> Array:
     """Interpolate the posture at an instant."""
     time, joints = path.time.numpy(), path.joints.numpy()
     return np.array([np.interp(instant, time, column) for column in joints.T])
+
+
+@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
+def _path(
+    generator: Any,
+    joints: tuple[float, ...],
+    poses: tuple[tuple[str, tuple[float, ...]], ...],
+    slides: tuple[float, ...],
+) -> Demonstration:
+    frames = {name: Frame(pose[:3], pose[3:]) for name, pose in poses}
+    options = [np.array([slides])] if slides else []
+    slow = replace(generator, rate=PATH_RATE)
+    [path] = slow.nominal([Situation(torch.tensor(joints), frames)], *options)
+    return path  # type: ignore[no-any-return]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
-from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import find_shaking, successful
@@ -19,7 +15,6 @@ from lerobot_env_bimanual.bottle.scene import TABLE_LOW, BottleScene
 from lerobot_env_bimanual.disturbances import Course
 from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.skill import FOOT, PHASES, SHOULDERS, TASK, BottleShaking
-from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["BottleShakingEnv"]
@@ -31,9 +26,6 @@ AMPLITUDE = BottleShaking.amplitude
 DURATION = 16.0
 #: Shaking begins at 8 s; half a second later there are two whole periods left to judge.
 COURSE = Course(grasp=4.0, latest=8.5, end=12.0)
-
-#: Time steps per second of the path on which a robot is put [1/s].
-PATH_RATE = 25.0
 
 
 class BottleShakingEnv(BottleEnv):
@@ -126,19 +118,7 @@ class BottleShakingEnv(BottleEnv):
         return successful(figures)
 
     def _draw(self, options: Mapping[str, Any]) -> Start:
-        start = draw_start(self.np_random, skill()).given(options, skill().robot)
-        self._scene.reset(start.poses["bottle"], start.joints, start.mass)
-        return start
+        return draw_start(self.np_random, skill()).given(options, skill().robot)
 
-    def _nominal(self) -> Demonstration:
-        return _path(tuple(self._start.joints), tuple(self._standing()))
-
-    def _stands_usually(self, bottle: Array) -> bool:
-        return skill().usual(Frame(bottle[:3], bottle[3:]))
-
-
-@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
-def _path(joints: tuple[float, ...], bottle: tuple[float, ...]) -> Demonstration:
-    frames = {"bottle": Frame(bottle[:3], bottle[3:])}
-    [path] = replace(skill(), rate=PATH_RATE).nominal([Situation(torch.tensor(joints), frames)])
-    return path
+    def _generator(self) -> BottleShaking:
+        return skill()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -78,7 +79,7 @@ class TorqueScene(BottleScene):
         self._obstacle = model.geom("obstacle").id if obstacle else -1
         self.stiffness, self.damping = np.full(n, STIFFNESS), np.full(n, DAMPING)
         self.torques: Array | None = None
-        self.force, self._touched = 0.0, math.inf
+        self.peak_force, self._touched = 0.0, math.inf
 
     @property
     def velocities(self) -> Array:
@@ -97,10 +98,12 @@ class TorqueScene(BottleScene):
             mujoco.mj_mulM(model, data, inertia[row], unit[row])
         return inertia[:, :n], data.qfrc_bias[:n].copy()
 
-    def reset(self, bottle: ArrayLike, joints: ArrayLike, mass: float) -> None:
-        """Stand still, as :meth:`BottleScene.reset` says, with nothing in the way."""
-        super().reset(bottle, joints, mass)
-        self.torques, self.force, self._touched = None, 0.0, math.inf
+    def reset(
+        self, poses: Mapping[str, Array], joints: Array, table: float, mass: float = 1.0
+    ) -> None:
+        """As :meth:`BottleScene.reset`, with the gains of the position control."""
+        super().reset(poses, joints, table, mass)
+        self.torques, self.peak_force, self._touched = None, 0.0, math.inf
         self.clear()
 
     def block(self, position: ArrayLike) -> float:
@@ -147,7 +150,7 @@ class TorqueScene(BottleScene):
             control = control + data.qfrc_bias[: self._n]
         super()._step(control)
         if self._obstacle >= 0 and (force := self._obstacle_force()):
-            self.force = max(self.force, force)
+            self.peak_force = max(self.peak_force, force)
             self._touched = min(self._touched, float(data.time))
 
     def _obstacle_force(self) -> float:
@@ -240,7 +243,7 @@ class BottleTorqueEnv(BottleShakingEnv):
         return self._scene.dynamics()
 
     def _measurements(self) -> dict[str, Any]:
-        return {"velocity": self._scene.velocities, "peak_contact_N": self._scene.force}
+        return {"velocity": self._scene.velocities, "peak_contact_N": self._scene.peak_force}
 
     def _read_action(self, action: ArrayLike) -> Array:
         """Check the references, and give gains or torques to the scene."""

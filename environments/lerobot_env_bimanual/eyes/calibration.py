@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import mujoco
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_env_bimanual.eyes.recorder import row
 from lerobot_env_bimanual.eyes.rig import Rig
-from lerobot_env_bimanual.robot_scene import TIMESTEP
+from lerobot_env_bimanual.robot_scene import TIMESTEP, RobotScene
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_vision.detection.tags import TagDetector
@@ -34,19 +34,19 @@ SPEED, LEAST, STILL = 1.0, 0.4, 0.4
 TASK = "show the tags in the hand to the camera"
 
 
-def chain_of(rig: Rig, link: str) -> NDArray[np.intp]:
+def chain_of(scene: RobotScene, link: str) -> NDArray[np.intp]:
     """Find the numbers of the joints that move a link, from its base on."""
-    model = rig.scene.model
+    model = scene.model
     body, chain = model.body(link).id, set[int]()
     while body:
         chain.add(int(body))
         body = model.body_parentid[body]
-    return np.flatnonzero(np.isin(model.jnt_bodyid[_driven(rig)], list(chain)))
+    return np.flatnonzero(np.isin(model.jnt_bodyid[_driven(scene)], list(chain)))
 
 
-def _driven(rig: Rig) -> NDArray[np.intp]:
+def _driven(scene: RobotScene) -> NDArray[np.intp]:
     """Return the numbers of the joints that have motors, among all."""
-    return np.asarray(rig.scene.model.actuator_trnid[:, 0], dtype=np.intp)
+    return np.asarray(scene.model.actuator_trnid[:, 0], dtype=np.intp)
 
 
 def varied_postures(rig: Rig, link: str, n: int, rng: np.random.Generator) -> Vector:
@@ -89,8 +89,8 @@ def _draw_candidates(
     rig: Rig, link: str, camera: str, rng: np.random.Generator
 ) -> tuple[list[Vector], list[Array]]:
     """Draw postures in which tags may be seen, and the poses of the tags before the camera."""
-    scene, moved = rig.scene, chain_of(rig, link)
-    low, high = scene.model.jnt_range[_driven(rig)[moved]].T
+    scene, moved = rig.scene, chain_of(rig.scene, link)
+    low, high = scene.model.jnt_range[_driven(scene)[moved]].T
     joints, kept, seen = scene.joints, list[Vector](), list[Array]()
     for shares in (1 + RANGE * rng.uniform(-1, 1, (DRAWN, len(moved)))) / 2:
         joints[moved] = low + shares * (high - low)
@@ -141,7 +141,7 @@ def _order_by_nearness(postures: list[Vector], last: Vector) -> Vector:
 def _place(rig: Rig, joints: Vector) -> None:
     """Put the joints somewhere."""
     model, data = rig.scene.model, rig.scene.data
-    data.qpos[model.jnt_qposadr[_driven(rig)]] = joints
+    data.qpos[model.jnt_qposadr[_driven(rig.scene)]] = joints
     mujoco.mj_kinematics(model, data)
 
 
@@ -163,24 +163,27 @@ def _faces(rig: Rig, pose: Array, link: str) -> bool:
 
 def calibration_episode(
     rig: Rig,
-    postures: Vector,
+    links: Iterable[str],
+    n: int,
     fps: int,
     rng: np.random.Generator,
     measure: Reading,
     command: Reading,
 ) -> Iterator[dict[str, Any]]:
-    """Let a robot go through postures, and stand still in each.
+    """Let a robot go through postures in which links show their tags, and stand still in each.
 
     Parameters
     ----------
     rig : Rig
         Its scene is simulated.
-    postures : ndarray of shape (n, n_joints)
-        [rad]
+    links : iterable of str
+        No joint moves two of them.
+    n : int
+        How many postures.
     fps : int
         Rows per second.
     rng : Generator
-        Of the noise of the pictures.
+        Of the postures and the noise of the pictures.
     measure, command : callable
         What the robot reads where its joints are (n_joints,) [rad], and what it calls
         references: with offsets, noise, in another unit.
@@ -193,6 +196,10 @@ def calibration_episode(
     """
     scene, period = rig.scene, round(1 / (TIMESTEP * fps))
     reference = scene.joints
+    postures = np.tile(reference, (n, 1))
+    for link in links:
+        moved = chain_of(scene, link)
+        postures[:, moved] = varied_postures(rig, link, n, rng)[:, moved]
     for posture in postures:
         seconds = max(LEAST, float(np.abs(posture - reference).max()) / SPEED)
         rows = round((seconds + STILL) * fps)

@@ -96,45 +96,17 @@ class Imperfections:
         Standard deviation of the blur of lens and sensor [pixels].
     noise : float, default=3
         Standard deviation of each value of each pixel [grey levels of 255].
-    motion : float, default=0
-        How far everything moves while the shutter is open, in a direction that is drawn
-        [pixels].
-    gain : float, default=1
-        By what values are multiplied: below 1 in the dark.
-    jpeg : int, optional
-        Quality at which pictures are compressed, 1 to 100.
     """
 
     blur: float = 0.6
     noise: float = 3.0
-    motion: float = 0.0
-    gain: float = 1.0
-    jpeg: int | None = None
 
     def __call__(self, picture: Picture, rng: np.random.Generator) -> Picture:
         """Spoil a picture (height, width, 3)."""
         seen: Any = picture
-        if self.gain != 1:
-            seen = cv2.convertScaleAbs(seen, alpha=self.gain)
-        if self.motion:
-            seen = cv2.filter2D(seen, -1, _streak(self.motion, rng.uniform(0, math.pi)))
         if self.blur:
             seen = cv2.GaussianBlur(seen, (0, 0), self.blur)
         if self.noise:
             noise = self.noise * rng.standard_normal(seen.shape, dtype=np.float32)
             seen = cv2.add(seen, noise, dtype=cv2.CV_8U)
-        if self.jpeg is not None:
-            quality = [cv2.IMWRITE_JPEG_QUALITY, self.jpeg]
-            seen = cv2.imdecode(cv2.imencode(".jpg", seen, quality)[1], cv2.IMREAD_COLOR)
         return np.asarray(seen, dtype=np.uint8)
-
-
-def _streak(length: float, angle: float) -> NDArray[np.float32]:
-    """Make a kernel that spreads a point over a line [pixels, rad]."""
-    half = math.ceil(length / 2) + 1
-    row = np.clip((length + 1) / 2 - np.abs(np.arange(-half, half + 1)), 0, 1)
-    level = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    level[half] = row
-    turn = cv2.getRotationMatrix2D((half, half), math.degrees(angle), 1.0)
-    kernel = np.asarray(cv2.warpAffine(level, turn, level.shape), np.float32)
-    return kernel / kernel.sum()

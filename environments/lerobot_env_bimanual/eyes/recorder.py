@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -106,30 +107,53 @@ def recording(
         write_cell(cell, new / CELL)
 
 
-def rig_to_record(
+@contextmanager
+def recording_before(
     env: Any,
+    out: str | Path,
     n: int,
-    cameras: str | Sequence[str],
-    size: tuple[int, int],
+    *,
+    cameras: str | Sequence[str] = "front",
+    size: tuple[int, int] = (640, 480),
+    cell: Mapping[str, Any] = MappingProxyType({}),
+    tags: Mapping[str, Any] = MappingProxyType({}),
     **options: Any,
-) -> Rig:
-    """Set up cameras before a ``ControlledEnv``, for a set of ``n`` episodes or postures."""
+) -> Iterator[tuple[Rig, Any]]:
+    """Open a set, as :func:`recording` does, for a ``ControlledEnv`` and cameras before it.
+
+    Parameters
+    ----------
+    env : ControlledEnv
+        In which an episode has begun.
+    out : str or Path
+        The folder.
+    n : int
+        How many episodes or postures are wanted.
+    cameras, size
+        As of :func:`~lerobot_env_bimanual.record.record`.
+    cell : mapping, optional
+        What the cell file has in it beside cameras, objects and joints.
+    tags : mapping, optional
+        What carries tags, as of :class:`Rig`.
+    **options
+        Of :func:`recording`.
+
+    Yields
+    ------
+    rig : Rig
+    LeRobotDataset
+    """
     if n < 1:
         raise DataError(f"at least one episode is recorded, got n={n}")
-    rig: Rig = env.rig(cameras, size, **options)
+    rig: Rig = env.rig(cameras, size, **tags)
     if not rig.views:
         raise DataError("a set with videos needs a camera: --cameras front")
-    return rig
-
-
-def recording_of(
-    env: Any, rig: Rig, out: str | Path, cell: Mapping[str, Any], **options: Any
-) -> AbstractContextManager[Any]:
-    """Open a set, as :func:`recording` does, for a ``ControlledEnv`` and what a rig sees."""
     names = [name + env.suffix for name in env.joint_names]
-    camera = rig.lens.camera
-    sizes = dict.fromkeys(rig.views, (camera.width, camera.height))
-    return recording(out, env.fps, names, sizes, cell, units=env.units, **options)
+    sizes = dict.fromkeys(rig.views, size)
+    cell = {**rig.content(), **env.cell_of_joints(), **cell}
+    with recording(out, env.fps, names, sizes, cell, units=env.units, **options) as opened:
+        yield rig, opened
+    rig.close()
 
 
 def _features(

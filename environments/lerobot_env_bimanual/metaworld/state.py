@@ -83,9 +83,7 @@ class MetaworldStateEnv(StateEnv):
         episode_length: int = 500,
         control: str = "reference",
         stop_at_success: bool = True,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
+        **rendering: Any,
     ) -> None:
         if fps != FPS or not 1 <= episode_length <= 500 or control not in CONTROL:
             raise DataError(
@@ -94,8 +92,7 @@ class MetaworldStateEnv(StateEnv):
             )
         self.task, self.task_description = check_task(task), task.removesuffix("-v3")
         library = metaworld_library()
-        size = (render_width, render_height)
-        super().__init__(fps, episode_length, CAMERA, render_mode, size)
+        super().__init__(fps, episode_length, CAMERA, **rendering)
         self.control, self.stop_at_success = control, stop_at_success
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about the types of its spaces

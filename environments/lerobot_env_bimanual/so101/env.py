@@ -13,18 +13,21 @@ from numpy.typing import ArrayLike
 from lerobot_env_bimanual.base import Array, Observation
 from lerobot_env_bimanual.bottle.measures import Figure, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
-from lerobot_env_bimanual.disturbances import Course, displace_pose
-from lerobot_env_bimanual.eyes.carriers import cube_at
+from lerobot_env_bimanual.disturbances import Course
+from lerobot_env_bimanual.eyes.carriers import Carrier, cube_at
 from lerobot_env_bimanual.eyes.views import around
 from lerobot_env_bimanual.so101 import N_JOINTS, TASKS
 from lerobot_env_bimanual.so101.kinematics import Reach
-from lerobot_env_bimanual.so101.robot import SIDES
+from lerobot_env_bimanual.so101.robot import SIDES, hand_of
 from lerobot_env_bimanual.so101.scene import (
     CARRIERS,
+    CUBE,
     GRIP,
+    LEFT,
     LEFT_UP,
     RIGHT,
     RIGHT_UP,
+    TAG,
     BiSo101Scene,
     in_left_hand,
 )
@@ -62,6 +65,11 @@ DURATION, COURSE = 17.0, Course(grasp=4.0, latest=9.0, end=11.5)
 CENTRE = (0.20, 0.0, 0.11)
 VIEWS = {"front": around(CENTRE, 0.7, 0.0, 40.0), "side": around(CENTRE, 0.7, -50.0, 40.0)}
 CHECKS = {"world": cube_at(0, 0.08, 0.35, 0.05)}
+
+#: The first number of the cube of tags in each gripper, and where cup and saucer are put
+#: meanwhile [m].
+IN_HAND = {"left": 30, "right": 40}
+AWAY = {"cup": (0.5, 0.45, 0.0), "saucer": (0.5, -0.45, 0.03)}
 
 
 class BiSo101Env(ControlledEnv):
@@ -140,6 +148,19 @@ class BiSo101Env(ControlledEnv):
         """The simulated world, which an expert sees."""
         return self._scene
 
+    def take_cubes(self) -> dict[str, Carrier]:
+        """Put cup and saucer away, and take a cube of tags in each gripper.
+
+        Returns
+        -------
+        dict of str to Carrier
+            The cubes by the links that they are at.
+        """
+        self._scene.let_go(LEFT)
+        for name, place in AWAY.items():
+            self._scene.put(name, np.array((*place, 1.0, 0.0, 0.0, 0.0)))
+        return {hand_of(side): cube_at(IN_HAND[side], z=CUBE, size=TAG) for side in SIDES}
+
     def in_stored_units(self, joints: Array) -> Array:
         """In LeRobot's units, as encoders measure them, what are true joints [rad]."""
         return np.asarray((joints - self._zero) / self._factor)
@@ -196,9 +217,5 @@ class BiSo101Env(ControlledEnv):
     def _act(self, stopped: bool) -> None:
         self._scene.grip()
 
-    def _usual(self, step: Array) -> bool:
-        return CUP_BOX.contains(displace_pose(self._start.poses["cup"], step))
-
-    def _displace(self, step: Array) -> None:
-        if RIGHT not in self._scene.taken:
-            self._scene.put("cup", displace_pose(self._start.poses["cup"], step))
+    def _stands_usually(self, pose: Array) -> bool:
+        return CUP_BOX.contains(pose)

@@ -14,15 +14,18 @@ from lerobot_env_bimanual.eyes.carriers import cube_at
 from lerobot_env_bimanual.robot_scene import (
     BOX,
     CYLINDER,
+    OBJECT,
     PALM,
     TABLE,
+    Hold,
+    RobotScene,
     add_geom,
     add_table,
+    add_thing,
     add_view,
 )
 from lerobot_env_bimanual.so101 import TASKS
 from lerobot_env_bimanual.so101.robot import PLAY, hand_of, so101_spec
-from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 
 OBJECTS = TASKS["cup_on_saucer"]
 LEFT = Hold(hand_of("left"), "saucer", "saucer")
@@ -63,7 +66,7 @@ PRESSED, REACH = 0.3, 0.01
 SETTLING = 1500
 
 
-class BiSo101Scene(SuiteScene):
+class BiSo101Scene(RobotScene):
     """The state of the simulated world.
 
     A gripper takes hold of what it may hold, as it then lies in it, when its moving jaw presses

@@ -21,13 +21,11 @@ from lerobot_env_bimanual.disturbances import (
     Disturbance,
     Spoilt,
     StartedMidway,
-    displace_pose,
     parse_condition,
 )
-from lerobot_env_bimanual.robot_scene import add_table
+from lerobot_env_bimanual.robot_scene import Hold, RobotScene, add_table
 from lerobot_env_bimanual.start import Start
 from lerobot_env_bimanual.suite.names import UPPER_BODY
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError
@@ -95,7 +93,7 @@ class SuiteEnv(ControlledEnv):
         Without gym-aloha, where its arms are asked for, or example-robot-data for ``g1``.
     """
 
-    _scene: SuiteScene
+    _scene: RobotScene
 
     def __init__(
         self, task: str, robot: str = UPPER_BODY, *, force: bool = False, **options: Any
@@ -116,7 +114,7 @@ class SuiteEnv(ControlledEnv):
         *_, last, _ = ends.values()
         super().__init__(
             self._task.robot,
-            SuiteScene(spec, self._task.objects, self._task.holds),
+            RobotScene(spec, self._task.objects, self._task.holds),
             self._task.duration,
             Course(grasp=ends[self._task.grasp], latest=last, end=last),
             mode="dynamic",
@@ -192,18 +190,8 @@ class SuiteEnv(ControlledEnv):
                 if part.step is not None:
                     self._displace(part.step)
 
-    def _usual(self, step: Array) -> bool:
-        return self._task.usual(displace_pose(self._first, step))
-
-    def _displace(self, step: Array) -> None:
-        name = self._task.objects[0]
-        if not any(hold.thing == name for hold in self._scene.taken):
-            self._scene.put(name, displace_pose(self._first, step))
-
-    @property
-    def _first(self) -> Array:
-        """Initial pose of the first object."""
-        return self._start.poses[self._task.objects[0]]
+    def _stands_usually(self, pose: Array) -> bool:
+        return self._task.usual(pose)
 
     def _take_snapshot(self) -> Any:
         return self._scene.snapshot(), copy.deepcopy(self._judge)

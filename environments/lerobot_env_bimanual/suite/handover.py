@@ -15,9 +15,14 @@ import numpy as np
 
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at, flat_at
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
-from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -55,7 +60,6 @@ class Handover(SuiteTask):
 
     name = "handover"
     description = "take the baton with the left hand, pass it to the right, put it on the stand"
-    objects = SUITE["handover"]
     foot = FOOT
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "raise": 0.8, "bring": 2.0, "meet": 1.2,
@@ -125,26 +129,37 @@ class Handover(SuiteTask):
         return [*(seen(*pair, orientation) for pair in (*pairs, last)), Canonical()]
 
 
-class _Judge(Judge):
+class PutDown(Judge):
+    """Opens the hand that has lifted the baton when that is down again."""
+
+    hold: ClassVar[Hold]
+
     def __init__(self) -> None:
         self.time = 0.0
         self.lifted = self.put = False
         self.opening = Closing(reach=PUT)
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
+        """Note whether the hand has lifted the baton."""
         self.time += seconds
-        self.lifted |= RIGHT in scene.held and height(scene) > LIFTED
+        self.lifted = self.hold in scene.held and (self.lifted or height(scene) > LIFTED)
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
-        if LEFT in scene.held and RIGHT in scene.held:
-            return (LEFT,)
-        near = self.lifted and RIGHT in scene.held
-        if near and self.opening.update(self.time, max(height(scene), 0.0)):
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
+        """Open it when the baton comes no nearer to the table."""
+        if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
             self.put = True
-            return (RIGHT,)
+            return (self.hold,)
         return ()
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+
+class _Judge(PutDown):
+    hold = RIGHT
+
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
+        both = LEFT in scene.held and RIGHT in scene.held
+        return (LEFT,) if both else super().lets_go(scene)
+
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             **on_stand(scene),
             "passed": float(LEFT in scene.taken and RIGHT in scene.taken),
@@ -152,7 +167,7 @@ class _Judge(Judge):
         }
 
 
-def on_stand(scene: SuiteScene) -> dict[str, float]:
+def on_stand(scene: RobotScene) -> dict[str, float]:
     """Measure how far the baton is from its place [mm], and how it leans [deg]."""
     baton, stand = scene.pose("baton"), scene.pose("stand")
     away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
@@ -162,6 +177,6 @@ def on_stand(scene: SuiteScene) -> dict[str, float]:
     }
 
 
-def height(scene: SuiteScene) -> float:
+def height(scene: RobotScene) -> float:
     """Return the height of the baton's foot above the table [m]."""
     return float(scene.pose("baton")[2] - FOOT - scene.table)

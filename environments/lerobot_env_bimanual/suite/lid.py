@@ -19,9 +19,7 @@ from torch import Tensor
 from lerobot_env_bimanual.bottle.measures import Closing, Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
-from lerobot_env_bimanual.robot_scene import TABLE, add_geom
-from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.robot_scene import TABLE, Hold, RobotScene, add_geom, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -31,13 +29,11 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    seen,
     vector,
 )
 from tpgmm_datasets.bottle.skill import place_hand
-from tpgmm_torch import Canonical, Frame, quaternions
+from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
-from tpgmm_torch.operators import Operator
 
 #: Half of the box along x, y and z [m]; its origin is in its middle.
 HALF = (0.05, 0.06, 0.04)
@@ -72,7 +68,6 @@ class Lid(SuiteTask):
 
     name = "lid"
     description = "hold the box with the left hand, open its lid with the right, close it"
-    objects = SUITE["lid"]
     foot = HALF[2]
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "open": 2.5, "keep": 2.0, "shut": 2.5,
@@ -81,6 +76,8 @@ class Lid(SuiteTask):
     carriers: ClassVar = {"box": cube_at(10, HALF[0] + CUBE_ROOM)}
     grasp, box = "close", AREA
     holds = (HELD, LID)
+    # the hands from each other: the closed chain
+    pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
     figures: ClassVar = {
         "opened_deg": Figure("opened [deg]", 1, low=OPEN),
         "kept_s": Figure("kept open [s]", 1, low=KEPT),
@@ -150,11 +147,6 @@ class Lid(SuiteTask):
         """Opens both hands when the lid was open for long enough, and is shut again."""
         return _Judge()
 
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """List the hands seen from the box, and from each other, which is the closed chain."""
-        pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
-        return [*(seen(*pair, orientation) for pair in pairs), Canonical()]
-
 
 def _turn_about_x(pose: Frame, angle: Tensor) -> Frame:
     """Turn a pose about its x axis by angles (...) [rad]."""
@@ -171,7 +163,7 @@ class _Judge(Judge):
         self.box: Pose | None = None
         self.shutting = Closing(reach=math.radians(SHUT))
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         self.time += seconds
         angle, place = self._angle(scene), scene.pose("box")[:3]
         if self.box is None or not scene.taken:
@@ -183,14 +175,14 @@ class _Judge(Judge):
         self.pull = max([self.pull, *map(scene.pull, scene.held)])
         self.lost |= not self.released and scene.held != scene.taken
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
         if self.released or self.kept < KEPT:
             return ()
         gap = math.radians(max(self._angle(scene), 0.0))
         self.released = self.shutting.update(self.time, gap)
         return tuple(scene.held) if self.released else ()
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "opened_deg": self.opened,
             "kept_s": self.kept,
@@ -200,6 +192,6 @@ class _Judge(Judge):
             "pull_n": self.pull,
         }
 
-    def _angle(self, scene: SuiteScene) -> float:
+    def _angle(self, scene: RobotScene) -> float:
         """By how much the lid is open [deg]."""
         return math.degrees(float(scene.data.joint("lid").qpos[0]))

@@ -20,9 +20,15 @@ from torch import Tensor
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
 from lerobot_env_bimanual.robot_scene import BOX as CUBOID
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
-from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    OBJECT,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -33,12 +39,10 @@ from lerobot_env_bimanual.suite.task import (
     Style,
     SuiteTask,
     raise_pose,
-    seen,
     shift_pose,
     vector,
 )
-from tpgmm_torch import Canonical, Frame, quaternions
-from tpgmm_torch.operators import Operator
+from tpgmm_torch import Frame, quaternions
 
 #: The peg's radius, half its length, and its head's radius and half length [m].
 RADIUS, LENGTH, HEAD = 0.012, 0.045, (0.022, 0.015)
@@ -74,7 +78,6 @@ class PegInHole(SuiteTask):
 
     name = "peg_in_hole"
     description = "take the peg and the block with a hole, and insert the peg in the air"
-    objects = SUITE["peg_in_hole"]
     foot = LENGTH
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 0.8, "bring": 2.0, "align": 1.2,
@@ -86,6 +89,8 @@ class PegInHole(SuiteTask):
     }
     grasp, box, grip, wait = "close", AREA, GRIP, WAIT
     holds = (PEG, BLOCK)
+    pairs = (("r_hand", "peg"), ("l_hand", "block"))
+    together = ("peg", "block"), ("r_hand", "l_hand")
     figures: ClassVar = {
         "depth_mm": Figure("depth [mm]", 1, low=1e3 * DEEP),
         "inserted_s": Figure("inserted for [s]", 1, low=0.5),
@@ -149,31 +154,18 @@ class PegInHole(SuiteTask):
         """Measures how deep the peg is, for how long, and how hard they press on each other."""
         return _Judge()
 
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Hands seen from where peg and block were, the peg from the block; the joints.
-
-        Without what is held, one hand from the other in place of the peg from the block.
-        """
-        together = ("peg", "block") if held else ("r_hand", "l_hand")
-        return [
-            seen("r_hand", "peg", orientation),
-            seen("l_hand", "block", orientation),
-            seen(*together, orientation, held),
-            Canonical(),
-        ]
-
 
 class _Judge(Judge):
     def __init__(self) -> None:
         self.force = self.inserted = 0.0
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         pressed = np.linalg.norm(scene.force("block", "peg"))
         self.force = max(self.force, float(pressed))
         deep = _depth(scene) >= DEEP and {PEG, BLOCK} <= scene.held
         self.inserted = self.inserted + seconds if deep else 0.0
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "depth_mm": 1e3 * _depth(scene),
             "inserted_s": self.inserted,
@@ -182,7 +174,7 @@ class _Judge(Judge):
         }
 
 
-def _depth(scene: SuiteScene) -> float:
+def _depth(scene: RobotScene) -> float:
     """Measure how deep the middle of the peg's end is in the hole, 0 beside it [m]."""
     peg, block = (scene.data.body(name) for name in ("peg", "block"))
     tip = peg.xpos - LENGTH * peg.xmat.reshape(3, 3)[:, 2]

@@ -6,27 +6,22 @@ is hard; the conditions ``slips`` and ``knocked`` spoil the first grasp.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 
-from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.robot_scene import Hold, RobotScene
 from lerobot_env_bimanual.suite.handover import (
     BOX,
     FOOT,
     LEFT,
-    LIFTED,
-    PUT,
     Handover,
-    height,
+    PutDown,
     on_stand,
-)  # fmt: skip
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
+)
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -39,7 +34,7 @@ from lerobot_env_bimanual.suite.task import (
     seen,
     vector,
 )
-from tpgmm_torch import Canonical, Demonstration, Frame
+from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.operators import Operator
 
 #: The shelf of the task ``shelf``, for the environment and for ``--policy.obstacles``.
@@ -48,8 +43,6 @@ SHELF = Path(__file__).with_name("shelf.xml")
 STANDS = (0.25, -0.04), (0.32, 0.0)
 #: How high the baton is lifted [m].
 LIFT = 0.07
-#: The last phase of each skill.
-SKILLS = {"pick": "lift", "place": "away", "home": "rest"}
 
 
 class PickPlace(Handover):
@@ -98,42 +91,19 @@ class PickPlace(Handover):
         hand = [seen("l_hand", frame, orientation) for frame in ("baton", "stand")]
         return [*hand, *own, Canonical()]
 
-    def operators_of(self, skill: str) -> list[Operator]:
-        """List the subspaces of ``pick``, ``place`` or ``home``, learned by itself."""
-        pick, *place, joints = self.operators()
-        return {"pick": [pick, joints], "place": [*place, joints]}.get(skill, [joints])
 
-    @staticmethod
-    def parts(recorded: Demonstration) -> dict[str, Demonstration]:
-        """Recordings of each skill, each on a clock that begins at 0."""
-        ends = [-math.inf, *(recorded.events[last] for last in SKILLS.values())]
-        found = {}
-        for name, (begin, end) in zip(SKILLS, pairwise(ends), strict=True):
-            part = recorded.at_steps((recorded.time > begin) & (recorded.time <= end))
-            time = part.time - part.time[0]
-            found[name] = Demonstration(time, part.joints, part.frames, part.joint_names)
-        return found
+class _Judge(PutDown):
+    hold = LEFT
 
-
-class _Judge(Judge):
     def __init__(self) -> None:
-        self.time = 0.0
-        self.lifted = self.put = False
+        super().__init__()
         self.first: Pose | None = None
-        self.opening = Closing(reach=PUT)
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         self.first = scene.pose("l_hand") if self.first is None else self.first
-        self.time += seconds
-        self.lifted = LEFT in scene.held and (self.lifted or height(scene) > LIFTED)
+        super().note(scene, seconds)
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
-        if self.lifted and self.opening.update(self.time, max(height(scene), 0.0)):
-            self.put = True
-            return (LEFT,)
-        return ()
-
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         hand = scene.pose("l_hand")
         home = hand - (hand if self.first is None else self.first)
         placed = {**on_stand(scene), "put": float(self.put)}
@@ -168,9 +138,9 @@ class _Clear(_Judge):
         super().__init__()
         self.inside = 0.0
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         super().note(scene, seconds)
         self.inside = max(self.inside, scene.depth("a shelf"))
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {**super().figures(scene), "inside_mm": 1e3 * self.inside}

@@ -21,9 +21,14 @@ from torch import Tensor
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import CUBE_ROOM, cube_at
-from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
-from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.robot_scene import (
+    CYLINDER,
+    TABLE,
+    Hold,
+    RobotScene,
+    add_geom,
+    add_thing,
+)
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -34,13 +39,11 @@ from lerobot_env_bimanual.suite.task import (
     Style,
     SuiteTask,
     raise_pose,
-    seen,
     vector,
 )
 from tpgmm_datasets.bottle.skill import between
-from tpgmm_torch import Canonical, Frame, quaternions
+from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
-from tpgmm_torch.operators import Operator
 
 #: Of the cup and the jug, whose frames are in their middle: radius, and half the height [m].
 CUP, CUP_HALF = 0.03, 0.03
@@ -79,7 +82,6 @@ class Pour(SuiteTask):
 
     name = "pour"
     description = "take the cup with the right hand, the jug with the left, pour into the cup"
-    objects = SUITE["pour"]
     foot = CUP_HALF
     phases: ClassVar = {
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
@@ -91,6 +93,8 @@ class Pour(SuiteTask):
     }
     grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
+    pairs = (("r_hand", "cup"), ("l_hand", "jug"))
+    together = ("jug", "cup"), ("l_hand", "r_hand")
     figures: ClassVar = {
         "poured": Figure("poured", 2, low=0.9),
         "spilled": Figure("spilled", 2, high=0.1),
@@ -155,16 +159,6 @@ class Pour(SuiteTask):
         """Follows what flows; hands do not open."""
         return _Judge()
 
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Each hand seen from what it takes, the jug seen from the cup; the joints."""
-        together = ("jug", "cup") if held else ("l_hand", "r_hand")
-        return [
-            seen("r_hand", "cup", orientation),
-            seen("l_hand", "jug", orientation),
-            seen(*together, orientation, held),
-            Canonical(),
-        ]
-
 
 def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:
     """Unit quaternions (..., 4) about an axis, for angles (...) [rad]."""
@@ -197,7 +191,7 @@ class _Judge(Judge):
         self.places: Array = np.zeros((0, 3))
         self.speeds: Array = np.zeros((0, 3))
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         before = _seen(scene, self.places)
         self.places = self.places + self.speeds * seconds
         self.places[:, 2] -= GRAVITY * seconds**2 / 2
@@ -220,7 +214,7 @@ class _Judge(Judge):
         self.amounts, self.places = self.amounts[~down], self.places[~down]
         self.speeds = self.speeds[~down]
 
-    def _flow(self, scene: SuiteScene, seconds: float) -> None:
+    def _flow(self, scene: RobotScene, seconds: float) -> None:
         """Let more leave the jug, where its rim is lowest."""
         axis = scene.data.body("jug").xmat.reshape(3, 3)[:, 2]
         down = axis[2] * axis - (0.0, 0.0, 1.0)
@@ -235,7 +229,7 @@ class _Judge(Judge):
             self.speeds = np.concatenate((self.speeds, speed[None]))
         self.mouth = mouth
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "poured": self.poured,
             "spilled": self.spilled,
@@ -245,13 +239,13 @@ class _Judge(Judge):
         }
 
 
-def _seen(scene: SuiteScene, places: Array) -> Array:
+def _seen(scene: RobotScene, places: Array) -> Array:
     """Places (n, 3) as seen from the cup [m]."""
     cup = scene.data.body("cup")
     return np.asarray((places - cup.xpos) @ cup.xmat.reshape(3, 3))
 
 
-def _lean(scene: SuiteScene, name: str) -> float:
+def _lean(scene: RobotScene, name: str) -> float:
     """Return the angle of an object's axis with the vertical [deg]."""
     cosine = float(scene.data.body(name).xmat[8])
     return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

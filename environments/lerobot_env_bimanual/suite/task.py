@@ -22,11 +22,13 @@ from torch import Tensor
 from lerobot_env_bimanual.base import Array
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import Carrier
+from lerobot_env_bimanual.robot_scene import Hold, RobotScene
+from lerobot_env_bimanual.suite.names import UPPER_BODY, tasks_of
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands, place_hand
 from tpgmm_torch import (
+    Canonical,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -126,7 +128,7 @@ class Judge(ABC):
     """
 
     @abstractmethod
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         """Look at the world after a tick in which the robot was not stopped.
 
         Parameters
@@ -135,12 +137,12 @@ class Judge(ABC):
             How long it took.
         """
 
-    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+    def lets_go(self, scene: RobotScene) -> Sequence[Hold]:
         """Choose the hands that open now."""
         return ()
 
     @abstractmethod
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         """Measure how well it goes, so far."""
 
 
@@ -156,8 +158,6 @@ class SuiteTask(ABC):
     #: The name, ``--env.task`` of LeRobot, and what data sets call it.
     name: ClassVar[str]
     description: ClassVar[str]
-    #: What is observed, in this order. The first one can be moved by others.
-    objects: ClassVar[tuple[str, ...]]
     #: How high the first object's origin is above the table [m].
     foot: ClassVar[float]
     #: Nominal seconds of each phase.
@@ -176,9 +176,18 @@ class SuiteTask(ABC):
     #: Where palms touch what they take, and where they wait, in its frame [m].
     grip: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     wait: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    #: What is seen from what; and of two things that come together, one from the other, and
+    #: which hand from the other one where held things are left out.
+    pairs: ClassVar[Sequence[tuple[str, str]]] = ()
+    together: ClassVar[tuple[tuple[str, str], tuple[str, str]] | None] = None
 
     def __init__(self, embodiment: Embodiment) -> None:
         self.embodiment = embodiment
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Name what is observed, in this order; the first one can be moved by others."""
+        return tasks_of(UPPER_BODY)[self.name]
 
     @property
     def robot(self) -> Robot:
@@ -214,7 +223,6 @@ class SuiteTask(ABC):
     def judge(self) -> Judge:
         """Make the judge of one episode."""
 
-    @abstractmethod
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """List the subspaces in which TP-GMM learns the task.
 
@@ -225,6 +233,11 @@ class SuiteTask(ABC):
         held : bool, default=True
             False leaves out what is carried as a thing of its own.
         """
+        found = [seen(*pair, orientation) for pair in self.pairs]
+        if self.together is not None:
+            things, hands = self.together
+            found.append(seen(*(things if held else hands), orientation, held))
+        return [*found, Canonical()]
 
     @cached_property
     def duration(self) -> float:

@@ -17,9 +17,7 @@ from torch import Tensor
 
 from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.eyes.carriers import flat_at
-from lerobot_env_bimanual.robot_scene import BOX, PALM, add_geom
-from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.robot_scene import BOX, PALM, Hold, RobotScene, add_geom, add_thing
 from lerobot_env_bimanual.suite.task import (
     Box,
     Frames,
@@ -29,13 +27,11 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    seen,
     shift_pose,
     vector,
 )
 from tpgmm_datasets.bottle.skill import HANDS, place_hand
-from tpgmm_torch import Canonical, Frame, quaternions
-from tpgmm_torch.operators import Operator
+from tpgmm_torch import Frame, quaternions
 
 #: How high the middle of the board is above the table, and half its sides and thickness [m].
 #: Its frame is in the middle of its upper side.
@@ -71,7 +67,6 @@ class Wipe(SuiteTask):
 
     name = "wipe"
     description = "steady the board with the left hand, wipe it with the right"
-    objects = SUITE["wipe"]
     foot = FOOT
     phases: ClassVar = {
         "reach": 2.0, "close": 1.5, "press": 1.2, "wipe": 6.0, "lift": 1.0, "away": 1.5,
@@ -81,6 +76,7 @@ class Wipe(SuiteTask):
     grasp, box = "close", AREA
     #: Nobody carries a board that stands fast.
     holds = ()
+    pairs = tuple((hand, "board") for hand in HANDS)
     figures: ClassVar = {
         "coverage": Figure("wiped", 2, low=0.9),
         "force": Figure("mean force [N]", 1, 4.0, 20.0),
@@ -157,10 +153,6 @@ class Wipe(SuiteTask):
         """Looks where the sponge presses on the board, and at the left palm meanwhile."""
         return _Judge()
 
-    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Both hands seen from the board; the joints. Nothing is carried."""
-        return [*(seen(hand, "board", orientation) for hand in HANDS), Canonical()]
-
 
 def _zigzag(done: Tensor) -> Tensor:
     """Places (..., 2) in the board's plane, when a share of the wiping is done [m]."""
@@ -198,7 +190,7 @@ class _Judge(Judge):
         self.wiped = np.zeros(shape, dtype=bool)
         self.pressed = self.impulse = self.edge = self.off = self.pause = 0.0
 
-    def note(self, scene: SuiteScene, seconds: float) -> None:
+    def note(self, scene: RobotScene, seconds: float) -> None:
         force = scene.touch("sponge", "board")
         low, high = FORCES
         if force < low:
@@ -212,7 +204,7 @@ class _Judge(Judge):
         if force <= high:
             self._wipe(scene)
 
-    def _wipe(self, scene: SuiteScene) -> None:
+    def _wipe(self, scene: RobotScene) -> None:
         """Mark the cells that are in the sponge, which gives way to the board."""
         rows, columns = (
             (np.arange(n) + 0.5) * CELL - half
@@ -224,7 +216,7 @@ class _Judge(Judge):
         inside = np.abs((cells - sponge.xpos) @ sponge.xmat.reshape(3, 3)) <= SPONGE
         self.wiped |= inside.all(-1)
 
-    def figures(self, scene: SuiteScene) -> dict[str, float]:
+    def figures(self, scene: RobotScene) -> dict[str, float]:
         return {
             "coverage": float(self.wiped.mean()),
             "force": self.impulse / self.pressed if self.pressed else 0.0,

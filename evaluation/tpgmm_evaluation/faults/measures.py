@@ -5,9 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from itertools import batched
-from multiprocessing import get_context
+from itertools import batched, chain
 
 import numpy as np
 import torch
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
 from tpgmm_evaluation.faults.runs import Log, Tick, simulate
+from tpgmm_evaluation.processes import call_all
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,9 +31,10 @@ def measure_runs(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measu
         groups[run.robot, run.rate].append(run)
     parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
     if workers == 1:
-        return [found for part in parts for found in _measure_part(part)]
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        return [found for part in pool.map(_measure_part, parts) for found in part]
+        found = [_measure_part(part) for part in parts]
+    else:
+        found = call_all(_measure_part, [(part,) for part in parts], workers)
+    return list(chain.from_iterable(found))
 
 
 def _measure_part(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:

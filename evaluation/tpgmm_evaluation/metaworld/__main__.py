@@ -6,28 +6,18 @@ one with more episodes adds those that are new.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import Any
 
-import torch
 import typer
 
-from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from lerobot_env_bimanual.metaworld.tasks import TASKS, check_task
-from tpgmm_evaluation.cells import Cell, Results, parse_numbers
-from tpgmm_evaluation.metaworld.learners import LEARNERS, Actor, Learner, settings_of
+from tpgmm_evaluation.cells import Cell, Job, Results, parse_numbers, run_cells
+from tpgmm_evaluation.metaworld.learners import LEARNERS, Learner
 from tpgmm_evaluation.metaworld.networks import Network
-from tpgmm_evaluation.metaworld.recordings import (
-    evaluation_seeds,
-    record_expert,
-    successes,
-    validation,
-)
+from tpgmm_evaluation.metaworld.recordings import evaluation_seeds
 from tpgmm_evaluation.metaworld.summary import (
     comparison_table,
     cost_table,
@@ -35,16 +25,13 @@ from tpgmm_evaluation.metaworld.summary import (
     summary,
     task_table,
 )
-from tpgmm_evaluation.metaworld.trials import try_out
+from tpgmm_evaluation.metaworld.trials import measure_cells, read_episodes
 from tpgmm_evaluation.report.pages import write_page
 from tpgmm_evaluation.report.tables import episode_table, write_table
 from tpgmm_tools.arguments import options
 from tpgmm_torch.exceptions import UnknownNameError
 
 app = typer.Typer(add_completion=False)
-
-#: Whose versions are written down with each cell.
-PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot", "diffusers")
 
 
 @options.command(app, "python -m tpgmm_evaluation.metaworld --tasks reach-v3 --seeds 0,1")
@@ -58,6 +45,7 @@ def run(
     record: int = 12,
     budget: float = Network.budget / 60,
     tuning: bool = False,
+    workers: int = 1,
     out: Path = Path("out/metaworld"),
 ) -> None:
     """Record experts, learn from them, and try what was learned in unseen situations.
@@ -80,34 +68,32 @@ def run(
         Minutes of the processor for each network at most.
     tuning : bool
         Try in other situations than those that are reported.
+    workers : int >= 1
+        Processes, of one thread each.
     out : ``DIR``
         Where results are.
     """
-    torch.set_num_threads(1)
     names = TASKS if tasks == "all" else [check_task(name) for name in tasks.split(",")]
     learners = _choose_learners(policies.split(","), 60 * budget)
     results = Results(out / ("tuning" if tuning else "cells"))
     situations = evaluation_seeds(episodes, tuning=tuning)
     counts = parse_numbers(demonstrations, "--demonstrations")
-    grid = list(product(parse_numbers(seeds, "--seeds"), counts))
+    grid = list(product(parse_numbers(seeds, "--seeds"), counts, learners))
+    jobs = []
     for task in names:
-        missing = {}
-        for (seed, n), policy in product(grid, learners):
-            cell = Cell(task, policy, n, seed)
-            done = _read_episodes(results, cell, settings_of(learners[policy]), situations)
-            if len(done) < episodes:
-                missing[cell] = done
-        if not missing:
-            continue
-        env = MetaworldStateEnv(task)
-        for cell, done in missing.items():
-            learner, folder = learners[cell.policy], out / "demonstrations"
-            result = _measure(env, cell, learner, folder, record, situations, done)
-            results.write(cell, result)
-            solved = sum(episode["success"] for episode in result["episodes"])
-            typer.echo(f"{cell.key}: {solved} of {episodes}")
-        env.close()
+        cells = [
+            cell
+            for cell in (Cell(task, policy, n, seed) for seed, n, policy in grid)
+            if len(read_episodes(results, cell, learners[cell.policy], situations)) < episodes
+        ]
+        if cells:
+            arguments = cells, learners, results, situations, record
+            jobs.append(Job(cells, results, arguments))
+    failures = run_cells(measure_cells, jobs, workers, typer.echo)
     report(results, out)
+    if failures:
+        typer.echo(f"{len(failures)} cells failed", err=True)
+        raise typer.Exit(1)
 
 
 def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
@@ -121,51 +107,6 @@ def _choose_learners(names: Sequence[str], budget: float) -> dict[str, Learner]:
             learner = replace(learner, budget=budget)
         learners[name] = learner
     return learners
-
-
-def _read_episodes(
-    results: Results, cell: Cell, settings: dict[str, Any], situations: Sequence[int]
-) -> list[dict[str, Any]]:
-    """Read episodes of a cell in the first of these situations, of the same settings."""
-    found = results.read(cell)
-    if found is None or found["settings"] != settings:
-        return []
-    seeds = [episode["seed"] for episode in found["episodes"]]
-    same = seeds[: len(situations)] == [*situations][: len(seeds)]
-    return list(found["episodes"]) if same else []
-
-
-def _measure(
-    env: MetaworldStateEnv,
-    cell: Cell,
-    learner: Learner,
-    folder: Path,
-    record: int,
-    situations: Sequence[int],
-    done: list[dict[str, Any]],
-) -> dict[str, Any]:
-    shown = record_expert(folder, cell.env, cell.seed, cell.demonstrations, record)
-    chosen = successes(shown, cell.demonstrations, cell.env)
-    held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
-    began = time.process_time()
-    actor: Actor = (
-        learner.fit(chosen, cell.seed, held_out)
-        if isinstance(learner, Network)
-        else learner.fit(chosen, cell.seed)
-    )
-    trained = time.process_time()
-    episodes = [*done, *try_out(env, actor, situations[len(done) :])]
-    return {
-        "episodes": episodes,
-        "settings": settings_of(learner),
-        "expert": {"episodes": len(shown), "successes": sum(e.success for e in shown)},
-        "demonstration_seeds": [episode.seed for episode in chosen],
-        "validation_seeds": [episode.seed for episode in held_out],
-        "training_seconds": trained - began,  # of the processor
-        "training_outcome": actor.outcome,
-        "evaluation_seconds": time.process_time() - trained,
-        "versions": {name: version(name) for name in PACKAGES},
-    }
 
 
 def report(results: Results, out: Path) -> None:

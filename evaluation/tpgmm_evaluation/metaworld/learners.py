@@ -174,7 +174,9 @@ class TaskParameterized:
 
     name = "tpgmm"
 
-    def fit(self, episodes: Sequence[Recorded], seed: int) -> TaskParameterizedActor:
+    def fit(
+        self, episodes: Sequence[Recorded], seed: int, validation: Sequence[Recorded] = ()
+    ) -> TaskParameterizedActor:
         """Learn from episodes; ``seed`` is that of EM."""
         robot = metaworld_robot()
         with warnings.catch_warnings():

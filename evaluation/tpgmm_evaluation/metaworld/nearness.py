@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tpgmm_torch import Canonical
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Regression
 
@@ -68,7 +67,7 @@ class Nearness:
         conditionals, total = [], n_demonstrations + self.strength
         for operator, found in zip(skill.operators, skill.conditionals, strict=True):
             covariance = found.covariance
-            if isinstance(operator, Canonical):
+            if operator.is_posture:
                 lengths = torch.zeros(found.mean.shape[-1], dtype=torch.bool)
                 lengths[list(skill.kinematics.lengths)] = True
                 covariance = covariance * (lengths[:, None] == lengths)

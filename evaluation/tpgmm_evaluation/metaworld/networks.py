@@ -47,7 +47,9 @@ class Perceptron:
 
     name = "perceptron"
 
-    def fit(self, episodes: Sequence[Recorded], seed: int) -> PerceptronActor:
+    def fit(
+        self, episodes: Sequence[Recorded], seed: int, validation: Sequence[Recorded] = ()
+    ) -> PerceptronActor:
         """Learn from episodes; ``seed`` is that of the weights."""
         observed = np.concatenate([episode.observed for episode in episodes])
         x = features(observed, relative=self.relative)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +47,12 @@ def summary(episodes: pd.DataFrame) -> str:
     episodes : DataFrame
         As :func:`~tpgmm_evaluation.report.tables.episode_table` makes it.
     """
-    rows = []
+    texts = {}
     for group, tasks in GROUPS.items():
         here = episodes[episodes.env.isin(tasks)]
-        if not here.empty:
-            texts = {place: _share(part, len(tasks)) for place, part in here.groupby(COLUMN)}
-            rows.append([f"{group} ({len(tasks)})", *_in_columns(texts, episodes)])
-    return table(["tasks", *_headings(episodes)], rows)
+        for place, part in here.groupby(COLUMN):
+            texts[(f"{group} ({len(tasks)})", *place)] = _share(part, len(tasks))
+    return _tabulate(["tasks"], texts)
 
 
 def _share(episodes: pd.DataFrame, n_tasks: int) -> str:
@@ -72,15 +71,27 @@ def _share(episodes: pd.DataFrame, n_tasks: int) -> str:
 
 def task_table(episodes: pd.DataFrame) -> str:
     """Tabulate successes task by task; ``episodes`` as for :func:`summary`."""
-    rows = []
-    for task, here in episodes.groupby("env"):
-        texts = {
-            place: f"{part.success.sum()}/{len(part)}" for place, part in here.groupby(COLUMN)
-        }
-        half = "tuned" if task in TUNED else "held"
-        rows.append([task, f"{difficulty(task)}, {half}", *_in_columns(texts, episodes)])
-    rows.sort(key=lambda row: TASKS.index(row[0]))
-    return table(["task", "", *_headings(episodes)], rows)
+    texts = {}
+    for task in TASKS:
+        kind = f"{difficulty(task)}, {'tuned' if task in TUNED else 'held'}"
+        for place, part in episodes[episodes.env == task].groupby(COLUMN):
+            texts[(task, kind, *place)] = f"{part.success.sum()}/{len(part)}"
+    return _tabulate(["task", ""], texts)
+
+
+def _tabulate(head: Sequence[str], texts: Mapping[tuple[Any, ...], str]) -> str:
+    """Tabulate texts by row, policy and number of demonstrations, with a column for these."""
+    columns = sorted({key[-2:] for key in texts}, key=_order)
+    rows = [
+        [*row, *(texts.get((*row, *place), "") for place in columns)]
+        for row in dict.fromkeys(key[:-2] for key in texts)
+    ]
+    return table([*head, *(f"{policy}, {n}" for policy, n in columns)], rows)
+
+
+def _order(place: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Put TP-GMM first."""
+    return (place[0] != REFERENCE, *place)
 
 
 def cost_table(results: Iterable[Mapping[str, Any]]) -> str:
@@ -100,10 +111,8 @@ def cost_table(results: Iterable[Mapping[str, Any]]) -> str:
         }
         for result in results
     )
-    groups = dict(list(cells.groupby(COLUMN)))
     rows = []
-    for policy, n in _columns(cells):
-        here = groups[policy, n]
+    for (policy, n), here in sorted(cells.groupby(COLUMN), key=lambda group: _order(group[0])):
         ends = here.outcome.value_counts(sort=True)
         reasons = "; ".join(f"{outcome}: {count}" for outcome, count in ends.items())
         medians = (f"{here[key].median():.3g}" for key in ("training", "action"))
@@ -170,17 +179,3 @@ def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
         Without suffix; ``.pdf`` and ``.webp`` are written.
     """
     write(success_panels(panels(episodes), LOOKS), path)
-
-
-def _columns(rows: pd.DataFrame) -> list[tuple[str, int]]:
-    """Return policies and numbers of demonstrations in the order of the columns."""
-    places = set(rows[COLUMN].itertuples(index=False, name=None))
-    return sorted(places, key=lambda place: (place[0] != REFERENCE, *place))
-
-
-def _headings(rows: pd.DataFrame) -> Iterator[str]:
-    return (f"{policy}, {n}" for policy, n in _columns(rows))
-
-
-def _in_columns(texts: Mapping[Any, str], rows: pd.DataFrame) -> list[str]:
-    return [texts.get(place, "") for place in _columns(rows)]

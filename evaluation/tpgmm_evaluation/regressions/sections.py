@@ -18,7 +18,7 @@ import numpy as np
 
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
+from tpgmm_evaluation.benchmarks import ALOHA, GROUPS
 from tpgmm_evaluation.cells import Cell, Results
 from tpgmm_evaluation.compare import compare
 from tpgmm_evaluation.regressions.goldens import GOLDENS
@@ -30,9 +30,6 @@ from tpgmm_torch.exceptions import TPGMMError
 
 #: Real recordings beside the checkout, and what ``examples/leave_one_out.py`` calls them.
 RECORDINGS = {"g1_bottle": "g1", "honeytea_bimanual": "honeytea", "so101_record": "so101"}
-ALOHA = ("aloha_state", "aloha_insertion")
-OTHERS = {*ALOHA, *(name for tasks in OTHER_ROBOTS.values() for name in tasks)}
-SUITE = tuple(name for name in BENCHMARKS if name not in OTHERS)
 #: Disturbances of the small form: one of the robot, one of the object, one of the sensor.
 FEW = ("stopped-3", "moved", "pose-noise")
 
@@ -227,7 +224,7 @@ SECTIONS: Mapping[str, Callable[[Plan], Iterator[tuple[str, Work]]]] = {
     "times": lambda plan: iter([("main", partial(measure_times, plan.root, plan.small))]),
     "recordings": recordings,
     "reach": reach,
-    "suite": partial(rollouts, SUITE, ("tpgmm", "tpgmm-auto"), False),
+    "suite": partial(rollouts, GROUPS["suite"], ("tpgmm", "tpgmm-auto"), False),
     "aloha": partial(rollouts, ALOHA, ("tpgmm",), False),
-    "disturbed": partial(rollouts, SUITE, ("tpgmm",), True),
+    "disturbed": partial(rollouts, GROUPS["suite"], ("tpgmm",), True),
 }

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -91,33 +91,19 @@ def _change(usual: Path, other: Path, sections: Sequence[str]) -> str:
     changes: dict[str, list[float]] = {"same": [0.0], "error": [], "score": [], "success": []}
     for _, before, now in pairs:
         for key in set(before) & set(now):
-            kind = key.partition(":")[0]
-            if kind in CHANGES:
-                changes[kind] += CHANGES[kind](key, before[key], now[key])
+            kind, _, name = key.partition(":")
+            changes.get(kind, []).extend(_change_of(kind, name, before[key], now[key]))
     worse = sum(bool(row.worse) and row.now != row.before for row in compare_cells(pairs))
-    means = {kind: np.mean(values) for kind, values in changes.items() if values}
     texts = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
-    parts = [texts[kind].format(mean) for kind, mean in means.items() if kind in texts]
+    parts = [text.format(np.mean(changes[k])) for k, text in texts.items() if changes[k]]
     return ", ".join([f"references up to {max(changes['same']):.2g}", *parts, f"{worse} worse"])
 
 
-def _move_of_references(key: str, before: Array, now: Array) -> list[float]:
-    same = "references" in key and before.shape == now.shape
-    return [float(np.abs(before - now).max())] if same else []
-
-
-def _growth(key: str, before: Array, now: Array) -> list[float]:
-    return [float(100 * (now.mean() / before.mean() - 1))] if before.mean() > 0 else []
-
-
-def _mean_change(key: str, before: Array, now: Array) -> list[float]:
+def _change_of(kind: str, name: str, before: Array, now: Array) -> list[float]:
+    """Compute how much a quantity changed, by its kind; nothing where that says nothing."""
+    if kind == "same":
+        same = "references" in name and before.shape == now.shape
+        return [float(np.abs(before - now).max())] if same else []
+    if kind == "error":
+        return [float(100 * (now.mean() / before.mean() - 1))] if before.mean() > 0 else []
     return [float((now - before).mean())]
-
-
-#: How much a quantity changed, by its kind; nothing where that says nothing.
-CHANGES: Mapping[str, Callable[[str, Array, Array], list[float]]] = {
-    "same": _move_of_references,
-    "error": _growth,
-    "score": _mean_change,
-    "success": _mean_change,
-}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pandas as pd
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
+from matplotlib.ticker import NullLocator, PercentFormatter
 
 from tpgmm_evaluation.jobs import POLICIES
 from tpgmm_evaluation.report.significance import REFERENCE
@@ -24,8 +23,15 @@ from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMIL
 FORMATS = (".pdf", ".webp")
 #: Panels side by side.
 COLUMNS = 4
-#: Colours of the families of policies beside TP-GMM: Okabe and Ito's, black and grey.
-COLOURS = (BLUE, GREEN, PURPLE, SKY, ORANGE, "0.1", "0.55")
+#: Colours of the families of policies: Okabe and Ito's; others are black.
+COLOURS = {
+    "tpgmm": VERMILION,
+    "key": BLUE,
+    "act": GREEN,
+    "diffusion": PURPLE,
+    "nearest": SKY,
+    "mean": ORANGE,
+}
 #: Markers and lines differ too, for readers without colours.
 MARKERS = "s^DvPX<>ph*d"
 LINES = ("--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
@@ -33,31 +39,16 @@ LINES = ("--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
 BRIGHT = 0.6
 
 
-def _family(policy: str) -> str:
-    """Return the family of a policy: the shortest name that its name begins with."""
-    first = policy.split()[0]
-    names = (name for name in POLICIES if first == name or first.startswith(f"{name}-"))
-    return min(names, key=len, default=first)
-
-
-@cache
 def _look(policy: str) -> dict[str, Any]:
     """Choose colour by family, marker and line by policy; the same in all figures."""
-    family = _family(policy)
     if policy == REFERENCE:
         return line_of(policy, VERMILION, "o") | {"linewidth": 2.0, "zorder": 4}
     names = [name for name in POLICIES if name != REFERENCE]
     index = names.index(policy) if policy in names else len(names) + len(policy)
-    families = list(dict.fromkeys(map(_family, POLICIES)))
-    if family == _family(REFERENCE):
-        colour = VERMILION
-    else:
-        families.remove(_family(REFERENCE))
-        at = families.index(family) if family in families else len(families)
-        colour = COLOURS[at % len(COLOURS)]
-    line = LINES[index % len(LINES)]
-    look = line_of(policy, colour, MARKERS[index % len(MARKERS)], line)
-    return look if policy == family else look | {"markerfacecolor": "white"}
+    family = policy.split()[0].partition("-")[0]
+    marker, line = MARKERS[index % len(MARKERS)], LINES[index % len(LINES)]
+    look = line_of(policy, COLOURS.get(family, "0.1"), marker, line)
+    return look if policy in (family, "key-poses") else look | {"markerfacecolor": "white"}
 
 
 def _looks(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
@@ -127,20 +118,6 @@ def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, 
     }
 
 
-def panels_for(
-    count: int, *, narrowest: float = 0.0, sharey: bool = False
-) -> tuple[Figure, list[Axes]]:
-    """Make a figure of panels, row by row, of at least a width [inch]."""
-    columns = min(COLUMNS, count)
-    rows = math.ceil(count / columns)
-    size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey).ravel()
-    for axes in grid[count:]:
-        axes.remove()
-    return figure, list(grid[:count])
-
-
 @rc_context(STYLE)
 def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw success over the number of demonstrations in panels, one an environment.
@@ -161,67 +138,54 @@ def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]
     Figure
     """
     tasks = list(dict.fromkeys(episodes.env))
-    figure, grid = panels_for(len(tasks), narrowest=4.2, sharey=True)
+    columns = min(COLUMNS, len(tasks))
+    rows = math.ceil(len(tasks) / columns)
+    size = (max(4.2, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    for axes in grid[len(tasks) :]:
+        axes.remove()
+    grid = grid[: len(tasks)]
+    shown: dict[str, Any] = {}
     for axes, task in zip(grid, tasks, strict=True):
         part = episodes[episodes.env == task]
         for index, (policy, look) in enumerate(looks.items()):
             chosen = part[part.policy == policy]
             if len(chosen):
-                counts = sorted(set(chosen.demonstrations))
-                _success_line(axes, chosen, spread(counts, index, len(looks)), look)
-        over_demonstrations(axes, part)
+                # a little aside, so that policies do not hide others
+                aside = (1 + min(0.04, 0.3 / len(looks))) ** (index - (len(looks) - 1) / 2)
+                shown[look["label"]] = _success_line(axes, chosen, aside, look)
+        counts = sorted(set(part.demonstrations))
+        axes.set(xscale="log", xlabel="demonstrations", ylim=(-0.05, 1.05))
+        axes.set_xticks(counts, map(str, counts))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlim(counts[0] / 1.3, counts[-1] * 1.3)
+        axes.grid(alpha=0.3)
         axes.set_title(task, fontsize="medium")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        axes.set_ylim(-0.05, 1.05)
     for axes in grid[::COLUMNS]:
         axes.set_ylabel("success")
-    add_legend(figure, grid, looks)
+    order = [look["label"] for look in looks.values() if look["label"] in shown]
+    figure.legend([shown[label] for label in order], order, loc="outside lower center", ncols=4)
     return figure
 
 
 def _success_line(
-    axes: Axes, episodes: pd.DataFrame, x: np.ndarray[Any, Any], look: Mapping[str, Any]
-) -> None:
+    axes: Axes, episodes: pd.DataFrame, aside: float, look: Mapping[str, Any]
+) -> Any:
+    """Draw the line of a policy in a panel, and the dots of its seeds; return the line."""
     groups = episodes.groupby("demonstrations").success
     rates = groups.mean()
     bounds = np.array([wilson(int(group.sum()), len(group)) for _, group in groups]).T
     gaps = np.abs(bounds - rates.to_numpy())
-    axes.errorbar(x, rates, yerr=gaps, capsize=1.5, elinewidth=0.8, **look)
-    places = dict(zip(rates.index, x, strict=True))
+    line = axes.errorbar(
+        rates.index * aside, rates, yerr=gaps, capsize=1.5, elinewidth=0.8, **look
+    )
     seeds = episodes.groupby(["demonstrations", "training_seed"]).success.mean()
     if len(seeds) > len(rates):
-        at = [places[count] for count, _ in seeds.index]
+        at = seeds.index.get_level_values("demonstrations") * aside
         axes.plot(at, seeds, ".", color=look["color"], markersize=3, alpha=0.6)
-
-
-def spread(counts: Sequence[int], index: int, total: int) -> np.ndarray[Any, Any]:
-    """Move numbers of demonstrations a little, so that policies do not hide others."""
-    width = min(0.04, 0.3 / total)
-    return np.asarray(counts) * (1 + width) ** (index - (total - 1) / 2)
-
-
-def over_demonstrations(axes: Axes, table: pd.DataFrame) -> None:
-    """Make the horizontal axis that of a table's numbers of demonstrations."""
-    counts = sorted(set(table.demonstrations))
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(FixedLocator(counts))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xticklabels([str(count) for count in counts])
-    axes.set_xlim(counts[0] / 1.3, counts[-1] * 1.3)
-    axes.set_xlabel("demonstrations")
-    axes.grid(alpha=0.3)
-
-
-def add_legend(
-    figure: Figure, panels: Iterable[Axes], looks: Mapping[str, Mapping[str, Any]]
-) -> None:
-    """Add a legend below the panels, each policy once, in the order of ``looks``."""
-    shown: dict[str, Any] = {}
-    for axes in panels:
-        handles, labels = axes.get_legend_handles_labels()
-        shown |= dict(zip(labels, handles, strict=True))
-    order = [look["label"] for look in looks.values() if look["label"] in shown]
-    figure.legend([shown[label] for label in order], order, loc="outside lower center", ncols=4)
+    return line
 
 
 def write(figure: Figure, path: Path) -> None:

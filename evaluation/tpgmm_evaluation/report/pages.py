@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,61 +10,27 @@ import pandas as pd
 
 from tpgmm_evaluation.jobs import POLICIES
 from tpgmm_evaluation.report.tables import wilson
-from tpgmm_evaluation.variants import EVEN_CLOCK, OPEN_LOOP, Variant
+from tpgmm_evaluation.variants import NAMED, Variant
 from tpgmm_torch.atomic import replacing
-
-PHASE = "the same, informed of the time and learning from episodes on a common clock"
-#: What each policy is, in the order of the report.
-DESCRIPTIONS = {
-    "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
-    "and the joints",
-    OPEN_LOOP: "the same, played by the clock with what is seen at the start, as in 0.1.0",
-    EVEN_CLOCK: "the same, watching the scene, but by the clock, wherever the robot is",
-    "tpgmm-places": "the same, learned and played with all objects as places: where they were "
-    "at the beginning, whoever holds them later",
-    "tpgmm-position-only": "the same without the orientation of the hands",
-    "tpgmm-no-joints": "the same without the joints as a subspace: the hands' poses alone",
-    "tpgmm-auto": "the same with the subspaces chosen by itself, operators='auto'",
-    "key-poses": "inverse kinematics to the hands' key poses, each seen from where "
-    "demonstrations differ least, along minimum-jerk paths with the mean timing",
-    "key-poses-posture": "the same with the mean demonstrated posture in the null space",
-    "act": "LeRobot's Action Chunking Transformer on joints and object poses",
-    "act-phase": PHASE,
-    "act-large": "it again, with LeRobot's own sizes: forty million weights",
-    "act-large-phase": PHASE,
-    "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
-    "diffusion-phase": PHASE,
-    "nearest": "replays the demonstration whose objects stood nearest: the naive floor",
-    "mean": "replays the mean of the aligned demonstrations, wherever the objects are",
-}
 
 
 def order_policies(policies: Iterable[str]) -> list[str]:
     """Return each policy once, in the order of the report, variants behind what they vary."""
-    names = list(dict.fromkeys((*DESCRIPTIONS, *POLICIES)))
 
-    def place(policy: str) -> tuple[int, str]:
-        if policy in names:
-            return names.index(policy), ""
-        return names.index(Variant.parse(policy).base), policy
+    def place(policy: str) -> tuple[int, int, str]:
+        base = Variant.parse(policy).base
+        rank = 2 + [*NAMED].index(policy) if policy in NAMED else int(policy != base)
+        return POLICIES.index(base), rank, policy
 
     return sorted(set(policies), key=place)
 
 
-def describe_policy(policy: str) -> str:
-    """Describe a policy in a line."""
-    if policy in DESCRIPTIONS:
-        return DESCRIPTIONS[policy]
+def describe_variant(policy: str) -> str:
+    """Describe a policy that has no description of its own."""
     variant = Variant.parse(policy)
     if not variant.overrides:
         return f"`{policy}`"
     return f"{variant.base} with {', '.join(f'`{item}`' for item in variant.overrides)}"
-
-
-def by_policy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Iterate over the rows of each policy, in the order of the report."""
-    for policy in order_policies(rows.policy):
-        yield policy, rows[rows.policy == policy]
 
 
 def write_page(path: Path, text: str) -> Path:
@@ -81,9 +47,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
 
 
-def rate(rows: pd.DataFrame) -> str:
-    """Format the successes of episodes; a dash where there are none."""
-    return rate_of(int(rows.success.sum()), len(rows)) if len(rows) else "-"
+def rate(successes: pd.Series[bool]) -> str:
+    """Format the share of successes."""
+    return rate_of(int(successes.sum()), len(successes))
 
 
 def rate_of(successes: int, trials: int) -> str:
@@ -130,8 +96,8 @@ def cost_table(cells: pd.DataFrame) -> str:
         per_episode=cells.evaluation_cpu_seconds / cells.episodes, megabytes=cells.bytes / 1e6
     )
     rows = [
-        [policy, *(_range(part[key], digits) for key, digits in COSTS.values())]
-        for policy, part in by_policy(cells)
+        [policy, *(_range(cells[key][cells.policy == policy], n) for key, n in COSTS.values())]
+        for policy in order_policies(cells.policy)
     ]
     return table(["policy", *COSTS], rows)
 

@@ -99,7 +99,9 @@ def write_summary(
         s=summary,
         failures=failures,
         commands=_keep_command(out / "commands.txt", command),
-        describe_policy=pages.describe_policy,
+        describe_variant=pages.describe_variant,
+        share=pages.share,
+        rate_of=pages.rate_of,
         reference=REFERENCE,
         nominal=NOMINAL,
         level=LEVEL,
@@ -155,23 +157,28 @@ class _Summary:
         results = [result for task in tasks for result in task.results]
         self.cells, self.episodes = cell_table(results), episode_table(results)
         self.comparisons = compare_pairs(self.episodes)
-        self.failed = self._list_failures()
-        self.nominal = self.episodes[self.episodes.condition == NOMINAL]
         self.policies = pages.order_policies(self.cells.policy)
         self.counts = sorted(set(self.cells.demonstrations))
         self.n_seeds = self.cells.seed.nunique()
         self.n_nominal = int((self.comparisons.condition == NOMINAL).sum())
         self.n_trials = int((self.episodes.policy == REFERENCE).sum())
+        self.failed = self._list_failures()
         lost = self.comparisons[self.comparisons.only_other > self.comparisons.only_reference]
         self.lost = lost.sort_values(["p_holm", "p"], kind="stable")
         best = best_others(self.comparisons)
         self.best = best[best.condition == NOMINAL]
+        # what is grouped by environment or policy comes in the order of the report
+        ordered = self.episodes.assign(
+            env=pd.Categorical(self.episodes.env, [*self.tasks]),
+            policy=pd.Categorical(self.episodes.policy, self.policies),
+        )
+        self.nominal = ordered[ordered.condition == NOMINAL]
+        self._select_disturbed(ordered)
         settings = [task.settings for task in tasks]
         self.fixed = [s.env for s in settings if s.demonstration_seed is not None]
         self.episodes_per_cell = min(s.episodes for s in settings)
         low, high = wilson(self.episodes_per_cell // 2, self.episodes_per_cell)
         self.uncertainty = f"{50 * (high - low):.0f}"
-        self._select_disturbed()
 
     def _list_failures(self) -> pd.DataFrame:
         """List failed episodes: nominal ones first, and those with the most demonstrations."""
@@ -183,17 +190,18 @@ class _Summary:
             kind="stable",
         )
 
-    def _select_disturbed(self) -> None:
+    def _select_disturbed(self, episodes: pd.DataFrame) -> None:
         """Select episodes beside disturbed ones, with the most demonstrations tried there."""
-        disturbed = self.episodes[self.episodes.condition != NOMINAL]
-        self.most = disturbed.demonstrations.max()
-        self.beside = self.episodes[self.episodes.demonstrations == self.most]
-        self.disturbed = disturbed[disturbed.demonstrations == self.most]
+        self.most = episodes[episodes.condition != NOMINAL].demonstrations.max()
+        beside = episodes[episodes.demonstrations == self.most]
+        self.disturbed = beside[beside.condition != NOMINAL]
         self.disturbed_policies = pages.order_policies(self.disturbed.policy)
         known = [c for b in self.benchmarks.values() for c in b.all_conditions]
-        found = set(self.beside.condition)
+        found = set(beside.condition)
         ordered = [name for name in dict.fromkeys(known) if name in found]
         self.conditions = [*ordered, *sorted(found - set(ordered))]
+        groups = beside.groupby(["policy", "env", "condition"], observed=True)
+        self.solved = groups.success.agg(["sum", "count"])
 
     def write_tables(self, out: Path) -> None:
         """Write the tables behind the report."""
@@ -209,31 +217,16 @@ class _Summary:
         if not self.nominal.empty:
             draw_success(self.nominal, folder / "success")
         if self.conditions:
-            shares = {p: self._condition_grid(p, "mean") for p in self.disturbed_policies}
-            draw_conditions(dict(list(shares.items())[:MAPS]), folder / "conditions")
-
-    def loss_table(self) -> str:
-        """Tabulate every comparison in which another policy solves more."""
-        head = ["task", "demonstrations", "condition", "other policy", REFERENCE, "other"]
-        head += [f"solved by other / {REFERENCE} alone", "seeds", "p", "p (Holm)", "verdict"]
-        rows = [
-            [
-                *(row.env, row.demonstrations, row.condition, row.policy),
-                *(pages.share(n, row.pairs) for n in (row.successes, row.other_successes)),
-                f"{row.only_other} / {row.only_reference}",
-                f"{row.seeds_worse} of {row.seeds}",
-                *(f"{row.p:.2g}", f"{row.p_holm:.2g}", row.verdict),
-            ]
-            for row in self.lost.itertuples()
-        ]
-        return pages.table(head, rows)
+            shares = (self.solved["sum"] / self.solved["count"]).unstack()[self.conditions]
+            rates = {policy: shares.loc[policy] for policy in self.disturbed_policies[:MAPS]}
+            draw_conditions(rates, folder / "conditions")
 
     def reasons(self) -> Iterator[str]:
         """Name the criteria that decided each lost comparison."""
-        tried = self.episodes.assign(success=self.episodes.success.astype(bool))
         for row in self.lost.itertuples():
             benchmark = self.benchmarks[row.env]
-            here = tried[(tried[PLACE] == [getattr(row, key) for key in PLACE]).all(axis=1)]
+            place = {key: [getattr(row, key)] for key in PLACE}
+            here = self.episodes.merge(pd.DataFrame(place), on=PLACE)
             ours = here[(here.policy == REFERENCE) & ~here.success]
             theirs = here[(here.policy == row.policy) & here.success]
             both = ours.merge(theirs[PAIR], on=PAIR)
@@ -248,92 +241,66 @@ class _Summary:
                 f"seeds {seeds})"
             )
 
-    def failure_table(self, most: int) -> str:
-        """Tabulate the first of the episodes that the reference does not solve."""
-        keys = ["env", "demonstrations", "training_seed", "condition", "evaluation_seed"]
-        head = ("task", "demonstrations", "training seed", "condition", "evaluation seed")
-        rows = self.failed.head(most)[[*keys, "missed"]].itertuples(index=False)
-        return pages.table([*head, "missed"], rows)
-
-    def repeat_commands(self) -> list[str]:
+    def repeat_commands(self) -> Iterator[str]:
         """Return commands that repeat the first failure of each task and condition."""
-        commands = []
         for row in self.failed.drop_duplicates(["env", "condition"]).itertuples():
             cell = Cell(row.env, row.policy, row.demonstrations, row.training_seed)
             directory = f"{row.env}/policies/{cell.training}"
             cells = self.cells[(self.cells.env == row.env) & (self.cells.policy == row.policy)]
             settings, rate = self.tasks[row.env].settings, cells.fps.iloc[0]
-            episode = row.evaluation_seed, 1
-            commands.append(
-                evaluation_command(settings, row.condition, directory, rate, *episode)
+            yield evaluation_command(
+                settings, row.condition, directory, rate, row.evaluation_seed, 1
             )
-        return commands
 
-    def _table_by_count(
-        self, head: Sequence[str], texts: Mapping[Any, Mapping[int, str]]
-    ) -> str:
+    def _table_by_count(self, head: Sequence[str], texts: pd.Series[str]) -> str:
         """Tabulate texts with a column for each number of demonstrations."""
-        rows = [[*key, *(row.get(n, "-") for n in self.counts)] for key, row in texts.items()]
-        return pages.table([*head, *(f"{n} demonstrations" for n in self.counts)], rows)
+        rows = texts.unstack("demonstrations").reindex(columns=self.counts).fillna("-")
+        columns = [f"{n} demonstrations" for n in self.counts]
+        return pages.table([*head, *columns], rows.reset_index().to_numpy())
 
     def best_table(self) -> str:
         """Tabulate verdicts beside the strongest of the others."""
-        texts: dict[tuple[str, ...], dict[int, str]] = {(env,): {} for env in self.tasks}
+        texts = pd.Series(
+            "-",
+            pd.MultiIndex.from_product([self.tasks, self.counts], names=["", "demonstrations"]),
+        )
         for row in self.best.itertuples():
             ours, theirs = (
                 pages.share(n, row.pairs) for n in (row.successes, row.other_successes)
             )
             tested = f", p = {row.p_holm:.2g}" if row.only_reference + row.only_other else ""
             text = f"{row.verdict}{tested} ({ours}; {row.policy} {theirs})"
-            texts[(row.env,)][row.demonstrations] = text
+            texts[row.env, row.demonstrations] = text
         return self._table_by_count(["task"], texts)
 
     def success_table(self) -> str:
         """Tabulate successes of each task and policy."""
-        texts = {
-            (env, policy): {n: pages.rate(part) for n, part in rows.groupby("demonstrations")}
-            for env in self.tasks
-            for policy, rows in pages.by_policy(self.nominal[self.nominal.env == env])
-        }
-        return self._table_by_count(["task", "policy"], texts)
+        groups = self.nominal.groupby(["env", "policy", "demonstrations"], observed=True)
+        return self._table_by_count(["task", "policy"], groups.success.agg(pages.rate))
 
     def mean_table(self) -> str:
         """Tabulate means over the tasks that each policy was tried in."""
-        texts = {}
-        for policy, rows in pages.by_policy(self.nominal):
-            rates = rows.groupby(["demonstrations", "env"]).success.mean()
-            texts[(policy,)] = {
-                n: f"{100 * part.mean():.0f} % ({100 * part.min():.0f} %; "
-                f"{(part >= 0.95).sum()} of {len(part)})"
-                for n, part in rates.groupby("demonstrations")
-            }
-        return self._table_by_count(["policy"], texts)
-
-    def _condition_grid(self, policy: str, what: str) -> pd.DataFrame:
-        """Aggregate the successes of a policy, tasks down and conditions across."""
-        chosen = self.beside[self.beside.policy == policy]
-        grid = chosen.assign(success=chosen.success.astype(float)).pivot_table(
-            values="success", index="env", columns="condition", aggfunc=what
+        rates = self.nominal.groupby(["policy", "demonstrations", "env"], observed=True)
+        texts = rates.success.mean().groupby(["policy", "demonstrations"], observed=True)
+        return self._table_by_count(
+            ["policy"],
+            texts.agg(
+                lambda part: (
+                    f"{100 * part.mean():.0f} % ({100 * part.min():.0f} %; "
+                    f"{(part >= 0.95).sum()} of {len(part)})"
+                )
+            ),
         )
-        rows = [env for env in self.tasks if env in grid.index]
-        return grid.reindex(index=rows, columns=self.conditions)
 
     def condition_table(self, policy: str) -> str:
         """Tabulate the successes of a policy in each task and condition."""
-        solved, tried = (self._condition_grid(policy, what) for what in ("sum", "count"))
+        solved = self.solved.loc[policy]
+        texts = solved["sum"].astype(str) + "/" + solved["count"].astype(str)
+        grid = texts.unstack().reindex(columns=self.conditions).fillna("-")
         theirs = self.disturbed[self.disturbed.policy == policy]
-        rows = [
-            [
-                env,
-                *(
-                    f"{solved.loc[env, name]:.0f}/{n:.0f}" if n > 0 else "-"
-                    for name, n in tried.loc[env].items()
-                ),
-                pages.rate(theirs[theirs.env == env]),
-            ]
-            for env in tried.index
-        ]
-        return pages.table(["task", *self.conditions, "disturbed"], rows)
+        every = theirs.groupby("env", observed=True).success.agg(pages.rate)
+        grid = grid.assign(disturbed=every).fillna("-").reset_index()
+        return pages.table(["task", *self.conditions, "disturbed"], grid.to_numpy())
 
     def describe_condition(self, condition: str) -> str:
         """Return the options of each disturbance, or the first line of its documentation."""
@@ -347,33 +314,23 @@ class _Summary:
 
     def error_tables(self) -> Iterator[tuple[str, str]]:
         """Tabulate figures of all policies, task by task."""
-        for env, benchmark in self.benchmarks.items():
+        for env, part in self.nominal.groupby("env", observed=True):
             # figures that only other tasks have are all NaN here
-            part = self.nominal[self.nominal.env == env].dropna(axis=1, how="all")
-            figures = {key: f for key, f in benchmark.figures.items() if key in part}
+            shown = part.dropna(axis=1, how="all")
+            figures = {k: f for k, f in self.benchmarks[env].figures.items() if k in shown}
             head = ["demonstrations", "policy", *(f.heading for f in figures.values())]
             rows = [
-                [n, policy, *(pages.spread(rows[key], f.digits) for key, f in figures.items())]
-                for n, chosen in part.groupby("demonstrations")
-                for policy, rows in pages.by_policy(chosen)
+                [*place, *(pages.spread(rows[key], f.digits) for key, f in figures.items())]
+                for place, rows in shown.groupby(["demonstrations", "policy"], observed=True)
             ]
-            if rows:
-                yield env, pages.table(head, rows)
+            yield env, pages.table(head, rows)
 
     def cost_table(self) -> str:
         """Tabulate costs of training and acting."""
         return pages.cost_table(self.cells[self.cells.condition == NOMINAL])
 
-    def demonstration_table(self, asked: float) -> str:
-        """Tabulate the successes of the experts."""
-        rows: list[list[str]] = []
+    def demonstrations(self) -> Iterator[tuple[str, list[int], int, int]]:
+        """Yield tasks, seeds, attempts of the experts, and how many of them succeed."""
         for env, task in self.tasks.items():
             table = count_demonstrations(task.folder)
-            tried, succeed = int(table.tried.sum()), int(table.succeed.sum())
-            if not tried:
-                rows.append([env, "-", "not at hand", "-"])
-                continue
-            met = "yes" if succeed >= asked * tried else "**no**"
-            text = pages.rate_of(succeed, tried)
-            rows.append([env, ", ".join(map(str, table.seed)), text, met])
-        return pages.table(["task", "seeds", "succeed", "as asked"], rows)
+            yield env, [*table.seed], int(table.tried.sum()), int(table.succeed.sum())

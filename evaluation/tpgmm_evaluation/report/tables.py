@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +46,14 @@ def cell_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def _row(result: Mapping[str, Any]) -> dict[str, Any]:
-    episodes, training = result["episodes"], result["training"]
-    successes = sum(episode["success"] for episode in episodes)
+    episodes, training = pd.DataFrame(result["episodes"]), result["training"]
+    successes = int(episodes.success.sum())
     low, high = wilson(successes, len(episodes))
+    spreads = {}
+    for key, values in episodes.drop(columns=["seed", "success"]).items():
+        spreads[f"{key}_median"] = float(np.median(values))
+        # not interpolated: a figure may be infinite
+        spreads[f"{key}_p95"] = float(np.percentile(values, 95, method="higher"))
     return {
         **{key: result["cell"][key] for key in KEYS},
         "episodes": len(episodes),
@@ -56,7 +61,7 @@ def _row(result: Mapping[str, Any]) -> dict[str, Any]:
         "success": successes / len(episodes),
         "success_low": low,
         "success_high": high,
-        **_spreads(pd.DataFrame(episodes)),
+        **spreads,
         **result["latency"],
         "training_seconds": training["seconds"],
         "training_outcome": training["outcome"],
@@ -64,24 +69,11 @@ def _row(result: Mapping[str, Any]) -> dict[str, Any]:
         "evaluation_seconds": result["evaluation_seconds"],
         # 0.1.0 did not take it
         "evaluation_cpu_seconds": result.get("evaluation_cpu_seconds", float("nan")),
-        "first_evaluation_seed": episodes[0]["seed"],
-        **{key: _text(result["settings"][key]) for key in ("options", "demonstration_seed")},
-        **{key: _text(result[key]) for key in ("versions", "machine")},
+        "first_evaluation_seed": result["episodes"][0]["seed"],
+        "options": json.dumps(result["settings"]["options"]),
+        "demonstration_seed": result["settings"]["demonstration_seed"],
+        **{key: json.dumps(result[key]) for key in ("versions", "machine")},
     }
-
-
-def _spreads(episodes: pd.DataFrame) -> dict[str, float]:
-    """Compute median and 95th percentile of each figure of episodes."""
-    found = {}
-    for key, values in episodes.drop(columns=["seed", "success"]).items():
-        found[f"{key}_median"] = float(np.median(values))
-        # not interpolated: a figure may be infinite
-        found[f"{key}_p95"] = float(np.percentile(values, 95, method="higher"))
-    return found
-
-
-def _text(value: Any) -> Any:
-    return json.dumps(value) if isinstance(value, Mapping | Sequence) else value
 
 
 def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -92,19 +84,19 @@ def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     and the versions of the packages as JSON. Environments have figures of their own; those of
     the others are NaN.
     """
-    rows = []
+    parts = []
     for result in results:
-        cell = {key: result["cell"][key] for key in KEYS}
-        cell["training_seed"] = cell.pop("seed")
+        cell = {key: result["cell"][key] for key in KEYS if key != "seed"}
+        cell["training_seed"] = result["cell"]["seed"]
         cell["demonstration_seed"] = result["settings"]["demonstration_seed"]
-        versions = _text(result["versions"])
-        for episode in result["episodes"]:
-            given = {key: value for key, value in episode.items() if key != "seed"}
-            row = {**cell, "evaluation_seed": episode["seed"], **given}
-            rows.append({**row, "versions": versions})
-    table = pd.DataFrame(rows)
-    # figures that came later stand before the versions all the same
-    return table[[key for key in table if key != "versions"] + ["versions"] * bool(rows)]
+        episodes = pd.DataFrame(result["episodes"]).rename(columns={"seed": "evaluation_seed"})
+        parts.append(episodes.assign(versions=json.dumps(result["versions"]), **cell))
+    if not parts:
+        return pd.DataFrame()
+    table = pd.concat(parts, ignore_index=True)
+    last = ["versions"]  # figures that came later stand before them all the same
+    first = [*cell, "evaluation_seed"]
+    return table[[*first, *table.columns.difference([*first, *last], sort=False), *last]]
 
 
 def count_demonstrations(folder: Path) -> pd.DataFrame:

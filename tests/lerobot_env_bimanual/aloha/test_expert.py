@@ -11,12 +11,6 @@ from tpgmm_torch.exceptions import DataError
 HOME = [0, -0.96, 1.16, 0, -0.3, 0, 0.1] * 2
 
 
-def follow(env, seed, references):
-    """The rewards of an episode."""
-    env.reset(seed=seed)
-    return [env.step(reference)[1] for reference in references]
-
-
 @pytest.mark.parametrize(("task", "fps"), [("transfer_cube", 50), ("insertion", 25)])
 def test_expert_solves_the_task(task, fps):
     env, expert = AlohaStateEnv(task, fps=fps, stop_at_success=False), AlohaExpert(task, fps)
@@ -27,7 +21,8 @@ def test_expert_solves_the_task(task, fps):
     assert env.action_space.contains(plans.min((0, 1)).astype(np.float32))
     assert env.action_space.contains(plans.max((0, 1)).astype(np.float32))
     for seed, plan in zip(seeds, plans, strict=True):
-        rewards = follow(env, seed, plan)
+        env.reset(seed=seed)
+        rewards = [env.step(reference)[1] for reference in plan]
         assert max(rewards) == 4
         assert 2 in rewards[: 4 * fps]  # lifted before it was handed over
         # the cube stays with the left gripper when the right one has left

@@ -33,9 +33,8 @@ def test_robot_is_the_one_of_the_physics():
     assert list(JOINTS) == constants.JOINTS
     robot = aloha_robot()
     assert robot.joint_names == JOINTS
-    model = mujoco.MjModel.from_xml_path(
-        str(constants.ASSETS_DIR / "bimanual_viperx_insertion.xml")
-    )
+    file = constants.ASSETS_DIR / "bimanual_viperx_insertion.xml"
+    model = mujoco.MjModel.from_xml_path(str(file))
     data = mujoco.MjData(model)
     joints = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 14))
     state = robot.state(joints)

@@ -40,10 +40,8 @@ def test_objects_lie_where_gym_aloha_puts_them_but_for_the_yaw(task):
     plain, turned = AlohaStateEnv(task, yaw_range=0), AlohaStateEnv(task, fps=25)
     drawn = []
     for seed in range(8):
-        theirs = {
-            "transfer_cube": sample_box_pose,
-            "insertion": lambda seed: np.concatenate(sample_insertion_pose(seed)),
-        }[task](seed)
+        draw = sample_box_pose if task == "transfer_cube" else sample_insertion_pose
+        theirs = np.hstack(draw(seed))
         assert np.array_equal(plain.reset(seed=seed)[0]["environment_state"], theirs)
         poses = turned.reset(seed=seed)[0]["environment_state"].reshape(-1, 7)
         assert np.array_equal(poses[:, :3], theirs.reshape(-1, 7)[:, :3])
@@ -101,13 +99,8 @@ def test_a_start_is_set_exactly(env):
     observation, info = env.reset(seed=0, options={"environment_state": pose, "joints": HOME})
     assert np.array_equal(observation["environment_state"], pose)
     assert observation["agent_pos"] == pytest.approx(HOME, abs=1e-12)
-    assert info == {
-        "is_success": False,
-        "max_reward": 0.0,
-        "lift_mm": 0.0,
-        "elapsed_s": 0.0,
-        "diverged": False,
-    }
+    zero = dict.fromkeys(("max_reward", "lift_mm", "elapsed_s"), 0.0)
+    assert info == {"is_success": False, "diverged": False, **zero}
     for _ in range(50):
         observation, *_ = env.step(HOME)
     assert observation["agent_pos"] == pytest.approx(HOME, abs=0.02)  # gravity
@@ -191,10 +184,9 @@ def test_lerobot_makes_the_environment():
 
 
 def test_no_display_no_drawing_and_no_warning():
-    program = (
-        "from lerobot_env_bimanual.aloha.state import AlohaStateEnv\n"
-        "env = AlohaStateEnv(); env.reset(seed=0); env.step(env.action_space.low * 0)\n"
-    )
+    module = "lerobot_env_bimanual.aloha.state"
+    program = f"from {module} import AlohaStateEnv; env = AlohaStateEnv(); env.reset(seed=0); "
+    program += "env.step(env.action_space.low * 0)"
     hidden = {"MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"}
     environment = {k: v for k, v in os.environ.items() if k not in hidden}
     command = [sys.executable, "-c", program]

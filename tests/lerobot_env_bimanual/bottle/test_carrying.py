@@ -1,22 +1,16 @@
 """The carrying environment: what is seen, when hands close and open, how it is judged."""
 
-import warnings
-
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env as check_by_gymnasium
-from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
 import lerobot_env_bimanual  # noqa: F401  registers the environment
 from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv, carrying
-from lerobot_env_bimanual.disturbances import CONDITIONS, Displaced, Stopped
-from tests.support.bottle_expert import nominal, perform
+from lerobot_env_bimanual.disturbances import Displaced, Stopped
+from tests.support.bottle_expert import nominal
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 
 FPS = 25
-FIGURES = {"put_mm", "put_deg", "standing", "grasp_mm", "grasp_deg"}
 
 
 def follow(env, path, seconds, seed=0, **options):
@@ -33,28 +27,6 @@ def path_of(env, seed=0, **options):
     return nominal(env)
 
 
-def test_the_checker_of_gymnasium_passes():
-    env = gym.make("lerobot_env_bimanual/CarryAndPut-v0", fps=50, noise=1.0).unwrapped
-    with warnings.catch_warnings():
-        # actions are angles, not numbers between -1 and 1
-        warnings.filterwarnings("ignore", message=".*symmetric and normalized")
-        check_by_gymnasium(env, skip_render_check=True)
-
-
-def test_lerobot_makes_them_with_every_option():
-    config = make_env_config("carry_and_put", fps=25, mode="kinematic", episode_length=2)
-    shapes = {key: value.shape for key, value in env_to_policy_features(config).items()}
-    assert shapes["observation.environment_state"] == (14,)
-    envs = make_env(config, n_envs=3)["carry_and_put"][0]
-    observation, _ = envs.reset(seed=[0, 1, 2])
-    for _ in range(2):
-        *_, truncated, info = envs.step(observation["agent_pos"].astype(np.float32))
-    assert truncated.all()
-    assert set(info["final_info"]) >= FIGURES
-    assert not info["final_info"]["is_success"].any()
-    envs.close()
-
-
 @pytest.mark.parametrize("mode", ["dynamic", "kinematic"])
 def test_the_bottle_slides_is_held_and_put_down(mode):
     env = CarryAndPutEnv(fps=FPS, mode=mode)
@@ -64,9 +36,8 @@ def test_the_bottle_slides_is_held_and_put_down(mode):
     bottle, tray = poses[:, :7], poses[:, 7:]
     np.testing.assert_array_equal(tray, np.broadcast_to(start.poses["tray"], tray.shape))
     # while the hands close it slides in its own direction, and no more while it is carried
-    forwards = Frame(start.poses["bottle"][:3], start.poses["bottle"][3:]).inverse_transform(
-        Frame(bottle[:, :3], bottle[:, 3:]).position
-    )
+    first = Frame(start.poses["bottle"][:3], start.poses["bottle"][3:])
+    forwards = first.inverse_transform(Frame(bottle[:, :3], bottle[:, 3:]).position)
     assert forwards[round(4.0 * FPS), 0] == pytest.approx(0, abs=1e-3)
     assert forwards[round(4.7 * FPS), 0] == pytest.approx(start.slide[0], abs=1e-3)
     height = bottle[:, 2] - start.poses["bottle"][2]
@@ -115,7 +86,7 @@ def test_pushed_back_it_is_held_as_it_was(moment, held):
     seen, _ = follow(env, path, moment)
     before, now = seen[round((moment - 2) * FPS)], seen[-1]
     np.testing.assert_allclose(now["environment_state"], before["environment_state"], atol=1e-9)
-    assert env._scene.held == held and not env._put
+    assert bool(env._scene.held) == held and not env._put
 
 
 def test_nothing_slides_while_the_robot_is_stopped():
@@ -126,13 +97,6 @@ def test_nothing_slides_while_the_robot_is_stopped():
     still = poses[round(4.32 * FPS) : round(5.28 * FPS)]
     assert np.ptp(still, axis=0).max() < 1e-9
     assert 0.001 < np.linalg.norm(still[0] - poses[0]) < abs(env._start.slide[0])
-
-
-@pytest.mark.parametrize("condition", CONDITIONS)
-def test_every_condition_can_be_mastered(condition):
-    env = CarryAndPutEnv(fps=FPS, condition=condition, mode="kinematic")
-    info = perform(env, seed=2)
-    assert info["is_success"] and info["put_mm"] < 1, (env._drawn, info)
 
 
 def test_a_start_can_be_chosen_and_impossible_ones_are_refused():
@@ -152,9 +116,8 @@ def test_situations_are_those_of_the_generator():
     env.reset(seed=7)
     [situation] = carrying().situations(1, seed=7)
     np.testing.assert_array_equal(env._start.joints, situation.joints)
-    np.testing.assert_array_equal(
-        env._start.poses["bottle"][:3], situation.frames["bottle"].position
-    )
+    place = situation.frames["bottle"].position
+    np.testing.assert_array_equal(env._start.poses["bottle"][:3], place)
     slides = []
     for seed in range(100):
         env.reset(seed=seed)

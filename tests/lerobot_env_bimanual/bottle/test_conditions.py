@@ -23,9 +23,8 @@ def test_the_seed_alone_gives_the_start():
         starts.append(env._start)
     for start in starts:
         np.testing.assert_array_equal(start.joints, situation.joints)
-        np.testing.assert_array_equal(
-            start.poses["bottle"][:3], situation.frames["bottle"].position
-        )
+        place = situation.frames["bottle"].position
+        np.testing.assert_array_equal(start.poses["bottle"][:3], place)
         assert repr(start) == repr(starts[0])
     env.reset()
     assert not np.array_equal(env._start.joints, situation.joints)

@@ -5,12 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_env_bimanual.bottle.measures import (
-    FIGURES,
-    Closing,
-    find_shaking,
-    successful,
-)
+from lerobot_env_bimanual.bottle import measures
 
 RATE = 50
 NOMINAL = 2 / 3
@@ -18,7 +13,7 @@ NOMINAL = 2 / 3
 
 def closes(gaps, rate=RATE):
     """The number of the step at which hands with these gaps close; None if they never do."""
-    closing = Closing()
+    closing = measures.Closing()
     for step, gap in enumerate(gaps):
         if closing.update(step / rate, gap):
             return step
@@ -82,7 +77,7 @@ def test_a_rhythm_is_found_between_other_motions(frequency, rate):
     rest = np.full(2 * rate, 0.6)
     left = np.concatenate((bring, 0.6 + shaken, rest))
     right = np.concatenate((-bring, 0.8 * shaken - 0.6, rest))  # which jumps
-    found = find_shaking(np.stack((left, right), axis=1), rate, NOMINAL)
+    found = measures.find_shaking(np.stack((left, right), axis=1), rate, NOMINAL)
     assert found.frequency == pytest.approx(frequency, rel=0.01)
     np.testing.assert_allclose(found.amplitudes, (0.25, 0.2), rtol=0.02)
     assert 3.8 <= found.start / rate <= 6.2
@@ -91,29 +86,29 @@ def test_a_rhythm_is_found_between_other_motions(frequency, rate):
 def test_drift_and_noise_hardly_matter():
     rng = np.random.default_rng(0)
     both = np.stack((wave(8), -wave(8)), axis=1) + np.linspace(0, 0.4, 400)[:, None]
-    found = find_shaking(both + rng.normal(0, 0.02, both.shape), RATE, NOMINAL)
+    found = measures.find_shaking(both + rng.normal(0, 0.02, both.shape), RATE, NOMINAL)
     assert found.frequency == pytest.approx(NOMINAL, rel=0.01)
     np.testing.assert_allclose(found.amplitudes, 0.25, rtol=0.03)
 
 
 def test_no_rhythm_has_no_amplitude():
-    assert find_shaking(np.zeros((400, 2)), RATE, NOMINAL).amplitudes.max() == 0
+    assert measures.find_shaking(np.zeros((400, 2)), RATE, NOMINAL).amplitudes.max() == 0
     line = np.linspace(0, 1, 400)[:, None].repeat(2, axis=1)
-    assert find_shaking(line, RATE, NOMINAL).amplitudes.max() < 1e-9
-    assert np.isfinite(find_shaking(line, RATE, NOMINAL).frequency)
+    assert measures.find_shaking(line, RATE, NOMINAL).amplitudes.max() < 1e-9
+    assert np.isfinite(measures.find_shaking(line, RATE, NOMINAL).frequency)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 149])
 def test_less_than_two_periods_are_too_short(steps):
-    found = find_shaking(np.ones((steps, 2)), RATE, NOMINAL)
+    found = measures.find_shaking(np.ones((steps, 2)), RATE, NOMINAL)
     assert found.frequency == 0 and not found.amplitudes.any()
     assert found.start == 0
 
 
 def test_success_needs_every_figure():
-    good = {name: f.high if f.low == 0 else f.low for name, f in FIGURES.items()}
-    assert successful({**good, "frequency_hz": 0.0})
-    for name, f in FIGURES.items():
+    good = {name: f.high if f.low == 0 else f.low for name, f in measures.FIGURES.items()}
+    assert measures.successful({**good, "frequency_hz": 0.0})
+    for name, f in measures.FIGURES.items():
         beyond = math.nextafter(f.high, math.inf) if f.low == 0 else math.nextafter(f.low, 0)
-        assert not successful({**good, name: beyond})
-        assert not successful({**good, name: math.nan})
+        assert not measures.successful({**good, name: beyond})
+        assert not measures.successful({**good, name: math.nan})

@@ -14,7 +14,7 @@ def test_the_simulated_robot_is_the_one_of_the_kinematics():
     robot = skill().robot
     for _ in range(5):
         joints = rng.uniform(robot.lower, robot.upper)
-        scene.reset([0.3, 0, 0.15, 1, 0, 0, 0], joints, 1.0)
+        scene.reset({"bottle": [0.3, 0, 0.15, 1, 0, 0, 0]}, joints, 0.0)
         state = robot.state(joints)
         for hand in ("l_hand", "r_hand"):
             body = scene.data.body(hand)

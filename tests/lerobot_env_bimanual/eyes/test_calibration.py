@@ -32,7 +32,7 @@ def env():
 
 def test_the_joints_that_move_a_link_are_those_of_its_chain(env):
     rig = env.rig("front", carriers=TAGS, objects={})
-    moved = [env.joint_names[one] for one in chain_of(rig, "r_hand")]
+    moved = [env.joint_names[one] for one in chain_of(rig.scene, "r_hand")]
     assert moved == [name for name in env.joint_names if not name.startswith("l_")]
 
 

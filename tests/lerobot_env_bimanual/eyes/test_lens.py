@@ -46,22 +46,20 @@ def test_a_lens_that_needs_a_wider_picture_is_refused():
 
 
 def test_pictures_follow_from_the_seed():
-    spoil = Imperfections(motion=3.0, jpeg=80)
+    spoil = Imperfections()
     one, same, other = (spoil(GREY, np.random.default_rng(seed)) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)
     assert (one != other).any()
 
 
-def test_noise_and_gain_are_what_they_say():
+def test_noise_is_what_it_says():
     rng = np.random.default_rng(0)
     noisy = Imperfections(noise=3.0)(GREY, rng).astype(float)
     assert noisy.std() == pytest.approx(3.0, rel=0.03)
     assert noisy.mean() == pytest.approx(128, abs=0.1)
-    dark = Imperfections(blur=0, noise=0, gain=0.25)(GREY, rng)
-    assert (dark == 32).all()
 
 
-def test_blur_and_motion_spread_a_point_by_so_much():
+def test_blur_spreads_a_point_by_so_much():
     point = np.zeros((61, 61, 3), np.uint8)
     point[30, 30] = 250
     large = cv2.resize(point, (305, 305), interpolation=cv2.INTER_NEAREST)
@@ -70,14 +68,3 @@ def test_blur_and_motion_spread_a_point_by_so_much():
     weights = blurred.sum(axis=1) / blurred.sum()
     variance = (weights * rows**2).sum() - (weights * rows).sum() ** 2
     assert variance == pytest.approx(4.0**2 + 25 / 12, rel=0.1)
-    moved = Imperfections(blur=0, noise=0, motion=12.0)(large, np.random.default_rng(0))[..., 0]
-    ys, xs = np.nonzero(moved > 5)
-    assert np.hypot(np.ptp(xs), np.ptp(ys)) == pytest.approx(12 + 5, abs=4)
-    assert moved.sum() == pytest.approx(large[..., 0].sum(), rel=0.02)
-
-
-def test_compression_changes_pictures_a_little():
-    rng = np.random.default_rng(0)
-    smooth = cv2.GaussianBlur(rng.integers(0, 255, (120, 160, 3), np.uint8), (0, 0), 3)
-    small = Imperfections(blur=0, noise=0, jpeg=50)(smooth, rng)
-    assert 0 < np.abs(small.astype(int) - smooth).mean() < 5

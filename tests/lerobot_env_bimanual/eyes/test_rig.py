@@ -1,5 +1,7 @@
 """Rendered cameras see tags where they are, and nothing is simulated otherwise."""
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -29,14 +31,9 @@ from tpgmm_vision.poses import inverse, transform
 
 pytestmark = pytest.mark.skipif(offscreen() is None, reason="nothing can be drawn here")
 
-TASKS = {
-    "bottle_shaking": BottleShakingEnv,
-    "carry_and_put": CarryAndPutEnv,
-    **{
-        name: lambda name=name, **options: SuiteEnv(name, **options)
-        for name in ("handover", "lid", "peg_in_hole", "pour", "wipe")
-    },
-}
+SUITE = ("handover", "lid", "peg_in_hole", "pour", "wipe")
+TASKS = {"bottle_shaking": BottleShakingEnv, "carry_and_put": CarryAndPutEnv}
+TASKS |= {name: partial(SuiteEnv, name) for name in SUITE}
 
 
 def rms_of_corners(rig, picture, camera):
@@ -125,11 +122,9 @@ def test_lerobot_sees_the_cameras(kind):
     )  # fmt: skip
     shapes = {key: value.shape for key, value in env_to_policy_features(config).items()}
     assert shapes.pop("action") == shapes.pop("observation.state")
-    assert shapes == dict.fromkeys(
-        ("observation.images.front", "observation.images.side"), (3, 60, 80)
-    )
-    [tasks] = make_env(config, n_envs=2).values()
-    [vector] = tasks.values()
+    keys = "observation.images.front", "observation.images.side"
+    assert shapes == dict.fromkeys(keys, (3, 60, 80))
+    [[vector]] = [list(tasks.values()) for tasks in make_env(config, n_envs=2).values()]
     observation, _ = vector.reset(seed=[0, 1])
     batch = preprocess_observation(observation)
     assert batch["observation.images.front"].shape == (2, 3, 60, 80)
@@ -139,9 +134,8 @@ def test_lerobot_sees_the_cameras(kind):
 
 def test_without_cameras_features_are_those_of_states():
     config = make_env_config("bottle_shaking", fps=25)
-    assert set(env_to_policy_features(config)) == {
-        *("action", "observation.state", "observation.environment_state")
-    }
+    states = {"observation.state", "observation.environment_state"}
+    assert set(env_to_policy_features(config)) == {"action"} | states
 
 
 def test_unknown_cameras_are_refused():

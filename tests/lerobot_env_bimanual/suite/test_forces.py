@@ -67,13 +67,10 @@ def test_an_object_is_not_where_it_is_seen(condition, height, angle):
     turn /= np.linalg.norm(turn)
     true = np.array([0.1, 0.2, 0.3, *turn])
     thought = part.observe(true, true, 0.0, rng)
-    local = quaternions.rotate(
-        quaternions.conjugate(torch.from_numpy(turn)), torch.from_numpy(true - thought)[:3]
-    )
+    back = quaternions.conjugate(torch.from_numpy(turn))
+    local = quaternions.rotate(back, torch.from_numpy(true - thought)[:3])
     np.testing.assert_allclose(local, [0, 0, height], atol=1e-12)
-    twist = quaternions.product(
-        quaternions.conjugate(torch.from_numpy(turn)), torch.from_numpy(thought[3:])
-    )
+    twist = quaternions.product(back, torch.from_numpy(thought[3:]))
     error = quaternions.log(twist).rad2deg().numpy()
     assert np.linalg.norm(error) == pytest.approx(angle)
     assert error[2] == pytest.approx(0)

@@ -14,7 +14,7 @@ from lerobot_env_bimanual.suite.peg_in_hole import (
     RADIUS,
 )
 from lerobot_env_bimanual.suite.tasks import suite_task
-from tests.support.suite_expert import replay, start_of, tick
+from tests.support.suite_expert import missed, replay, start_of, tick
 from tpgmm_torch.operators.text import format_operator
 
 FPS = 25
@@ -31,45 +31,16 @@ def env():
     return SuiteEnv("peg_in_hole", fps=FPS)
 
 
-def failing(info):
-    """The criteria that are not met."""
-    return {name for name, f in TASK.figures.items() if not f.low <= info[name] <= f.high}
-
-
-def test_experts_insert_the_peg(motions, env):
-    for seed, motion in enumerate(motions):
-        info = replay(env, motion, seed=seed)
-        assert info["is_success"] and not failing(info)
-        assert 36 < info["depth_mm"] < 42  # it leads 40 mm in, and arms give way
-        assert info["inserted_s"] > 1.2 and info["force_n"] < 20
-
-
 def test_the_peg_is_seen_from_the_block_as_it_is_carried():
     *_, together, _ = map(format_operator, TASK.operators())
     assert together == "pose:peg@held:block"
-
-
-def test_half_the_way_is_not_deep_enough(motions, env):
-    references = motions[0].joints.numpy()
-    begin, end = (tick(motions[0], event) for event in ("align", "insert"))
-    info = replay(env, motions[0], references[: round(begin + 0.55 * (end - begin))])
-    assert 5 < info["depth_mm"] < 30
-    assert failing(info) == {"depth_mm", "inserted_s"}
 
 
 def test_the_peg_has_to_stay_in_for_half_a_second(motions):
     end = tick(motions[0], "insert") - round(0.6 * FPS)
     env = SuiteEnv("peg_in_hole", fps=FPS, episode_length=end)
     info = replay(env, motions[0])
-    assert info["depth_mm"] > 30 and failing(info) == {"inserted_s"}
-
-
-def test_out_again_it_is_not_inserted(motions, env):
-    references = motions[0].joints.numpy()
-    outside, inside = (tick(motions[0], event) for event in ("align", "insert"))
-    back = references[outside:inside][::-2]  # at twice the speed
-    info = replay(env, motions[0], np.concatenate((references[:inside], back)))
-    assert failing(info) == {"depth_mm", "inserted_s"} and info["depth_mm"] == 0
+    assert info["depth_mm"] > 30 and missed(TASK, info) == {"inserted_s"}
 
 
 def test_a_peg_beside_the_hole_jams(motions, env):
@@ -90,7 +61,7 @@ def test_a_peg_that_is_levered_presses_and_is_lost_at_last(motions, env, turn, w
     turned = turn * np.minimum(np.arange(2 * FPS) / FPS, 1)
     push[:, env.joint_names.index("r_shoulder_yaw")] += turned
     info = replay(env, motions[2], np.concatenate((references, push)))
-    assert wanted <= failing(info), info
+    assert wanted <= missed(TASK, info), info
     assert env._scene.taken == {PEG, BLOCK}
 
 
@@ -125,15 +96,3 @@ def test_depth_counts_within_the_hole_alone(env):
         env._scene.put("peg", np.concatenate((block[:3] + offset, block[3:])))
         wanted = 1e3 * max(depth, 0.0) if aside == 0 else 0.0
         assert env.figures()["depth_mm"] == pytest.approx(wanted, abs=1e-6)
-
-
-def test_pegs_and_blocks_are_drawn_where_they_are_usual():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        poses = TASK.draw(rng)
-        assert TASK.usual(poses["peg"])
-        # both stand on one table
-        feet = poses["peg"][2] - LENGTH, poses["block"][2] - HEIGHT
-        assert feet[0] == pytest.approx(feet[1])
-        assert poses["peg"][1] < -0.06 and poses["block"][1] > 0.06
-    assert not TASK.usual(poses["block"])

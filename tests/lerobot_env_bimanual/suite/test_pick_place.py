@@ -36,10 +36,3 @@ def test_a_spoilt_grasp_leaves_the_baton_and_the_hand_may_take_it_again(motion, 
     for reference in again.joints.numpy()[: int(RATE * TASK.ends()["lift"])]:
         env.step(reference)
     assert env._scene.held == {hold}
-
-
-def test_parts_begin_at_0_and_follow_on_each_other(motion):
-    parts = TASK.parts(motion)
-    assert list(parts) == ["pick", "place", "home"]
-    assert all(float(part.time[0]) == 0.0 for part in parts.values())
-    assert sum(map(len, parts.values())) == len(motion)

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from lerobot_env_bimanual.bottle.conditions import skill
-from lerobot_env_bimanual.robot_scene import TABLE, add_table, robot_spec
-from lerobot_env_bimanual.suite.scene import (
+from lerobot_env_bimanual.robot_scene import (
     OBJECT,
+    TABLE,
     Hold,
-    SuiteScene,
+    RobotScene,
+    add_table,
     add_thing,
+    robot_spec,
 )
 
 LEFT = Hold("l_hand", "rod", "rod")
@@ -25,28 +27,18 @@ def at(*position):
     return np.array([*position, 1.0, 0.0, 0.0, 0.0])
 
 
-def made():
+@pytest.fixture
+def scene():
     """A thin rod, and a cube on a shelf that cannot be moved, far from the table."""
-    spec = robot_spec()
+    spec, kinds = robot_spec(), mujoco.mjtGeom
     add_table(spec, 0.7)
-    add_thing(spec, "rod").add_geom(
-        name="rod",
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=(0.01, 0.06, 0),
-        mass=MASS,
-        contype=0,
-        conaffinity=TABLE,
-    )
+    rod = {"type": kinds.mjGEOM_CYLINDER, "size": (0.01, 0.06, 0)}
+    add_thing(spec, "rod").add_geom(name="rod", mass=MASS, contype=0, conaffinity=TABLE, **rod)
+    box = {"type": kinds.mjGEOM_BOX, "size": (0.02, 0.02, 0.02), "mass": MASS}
     for name, free in (("cube", True), ("shelf", False)):
-        add_thing(spec, name, free=free).add_geom(
-            name=f"{name} box",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(0.02, 0.02, 0.02),
-            mass=MASS,
-            contype=OBJECT,
-            conaffinity=OBJECT,
-        )
-    return SuiteScene(spec, ("rod", "cube", "shelf"), (LEFT, RIGHT))
+        thing = add_thing(spec, name, free=free)
+        thing.add_geom(name=f"{name} box", contype=OBJECT, conaffinity=OBJECT, **box)
+    return RobotScene(spec, ("rod", "cube", "shelf"), (LEFT, RIGHT))
 
 
 def beside(scene, hand="l_hand", off=0.02):
@@ -71,20 +63,17 @@ def seen_from_hand(scene, hand="l_hand"):
     return body.xmat.reshape(3, 3).T @ (rod.xpos - body.xpos)
 
 
-def test_what_is_observed_stands_where_it_is_put():
-    scene = made()
+def test_what_is_observed_stands_where_it_is_put(scene):
     begin(scene, shelf=at(0.5, 0.5, 0.5), cube=at(0.9, 0.1, 0.2))
     np.testing.assert_allclose(scene.pose("shelf"), at(0.5, 0.5, 0.5))
     np.testing.assert_allclose(scene.pose("cube"), at(0.9, 0.1, 0.2))
-    assert [pose.tolist() for pose in scene.objects] == [
-        scene.pose(name).tolist() for name in ("rod", "cube", "shelf")
-    ]
+    poses = [scene.pose(name) for name in ("rod", "cube", "shelf")]
+    np.testing.assert_array_equal(scene.objects, poses)
     assert scene.table == -1.0
     np.testing.assert_array_equal(scene.joints, JOINTS)
 
 
-def test_a_hand_carries_what_it_holds_and_nothing_else():
-    scene = made()
+def test_a_hand_carries_what_it_holds_and_nothing_else(scene):
     begin(scene)
     before = seen_from_hand(scene)
     scene.hold(LEFT)
@@ -101,8 +90,7 @@ def test_a_hand_carries_what_it_holds_and_nothing_else():
     assert scene.pull(LEFT) == 0
 
 
-def test_a_light_thing_that_is_held_beside_its_middle_does_not_hang_down():
-    scene = made()
+def test_a_light_thing_that_is_held_beside_its_middle_does_not_hang_down(scene):
     begin(scene)
     scene.hold(LEFT)
     wait(scene, 1.0)
@@ -110,8 +98,7 @@ def test_a_light_thing_that_is_held_beside_its_middle_does_not_hang_down():
     assert math.degrees(2 * math.acos(min(1.0, w))) < 1.0
 
 
-def test_a_palm_touches_what_it_is_told_to():
-    scene = made()
+def test_a_palm_touches_what_it_is_told_to(scene):
     gaps = []
     for off in (0.05, 0.08):
         begin(scene, rod=beside(scene, off=off))
@@ -124,8 +111,7 @@ def test_a_palm_touches_what_it_is_told_to():
     assert scene.gap(LEFT) < 0
 
 
-def test_a_thing_presses_on_what_it_stands_on():
-    scene = made()
+def test_a_thing_presses_on_what_it_stands_on(scene):
     begin(scene)
     wait(scene, 0.5)
     assert scene.touch("cube box", "shelf box") == pytest.approx(MASS * GRAVITY, rel=0.01)
@@ -136,8 +122,7 @@ def test_a_thing_presses_on_what_it_stands_on():
     assert not scene.force("rod", "shelf").any()
 
 
-def test_put_back_the_world_is_what_it_was():
-    scene = made()
+def test_put_back_the_world_is_what_it_was(scene):
     begin(scene)
     scene.hold(LEFT)
     wait(scene, 0.1)
@@ -158,8 +143,7 @@ def test_put_back_the_world_is_what_it_was():
     assert scene.pull(RIGHT) == 0
 
 
-def test_an_episode_begins_with_empty_hands():
-    scene = made()
+def test_an_episode_begins_with_empty_hands(scene):
     begin(scene)
     scene.hold(LEFT)
     wait(scene, 0.1)

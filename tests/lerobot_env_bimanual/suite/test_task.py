@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lerobot_env_bimanual.bottle.conditions import skill
-from lerobot_env_bimanual.suite import handover, pour
+from lerobot_env_bimanual.suite import handover, peg_in_hole, pour
 from lerobot_env_bimanual.suite.env import SuiteEnv
 from lerobot_env_bimanual.suite.names import MORE, OBSTRUCTED, SUITE
 from lerobot_env_bimanual.suite.task import (
@@ -250,3 +250,21 @@ def test_upright_poses_stand_in_their_box_and_others_do_not():
         half = math.radians(angle) / 2
         turned[3], turned[axis] = math.cos(half), math.sin(half)
         assert not BOX.contains(turned)
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "side", "aside", "lower"),
+    [
+        ("handover", "stand", 1, 0.0, suite_task("handover").foot),
+        ("peg_in_hole", "block", -1, 0.06, peg_in_hole.LENGTH - peg_in_hole.HEIGHT),
+        ("pour", "jug", -1, 0.0, pour.CUP_HALF - pour.JUG_HALF),
+    ],
+)
+def test_two_objects_stand_on_one_table_each_on_its_side(name, other, side, aside, lower):
+    task, rng = suite_task(name), np.random.default_rng(0)
+    for _ in range(50):
+        poses = task.draw(rng)
+        first, second = poses[task.objects[0]], poses[other]
+        assert task.usual(first) and not task.usual(second)
+        assert second[2] == pytest.approx(first[2] - lower)
+        assert side * first[1] > aside and -side * second[1] > aside

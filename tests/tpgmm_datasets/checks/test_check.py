@@ -57,15 +57,11 @@ def test_a_mistake_is_noticed_once_and_by_its_name(mistake, tmp_path):
 def test_fit_and_loaders_agree_on_limits_and_order(spoil, named):
     robot, known = upper_body(), ("units", "limits", "order")
     names = robot.joint_names if named else None
-    shown = [
-        replace(one, joints=spoil(one.joints), joint_names=names)
-        for one in generator().demonstrations(3, seed=0)
-    ]
-    found = [
-        [str(finding) for finding in report if finding.check in known]
-        for report in (check(shown, robot), fit_check(summarize(shown, robot), robot))
-    ]
-    assert found[0] == found[1] != []
+    good = generator().demonstrations(3, seed=0)
+    shown = [replace(one, joints=spoil(one.joints), joint_names=names) for one in good]
+    reports = check(shown, robot), fit_check(summarize(shown, robot), robot)
+    one, other = ([str(f) for f in report if f.check in known] for report in reports)
+    assert one == other != []
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -105,23 +101,19 @@ def test_joints_are_checked_in_the_order_of_the_robot():
     names = recorded[0].joint_names
     turned = [replace(d, joints=d.joints.flip(1), joint_names=names[::-1]) for d in recorded]
     assert checks(turned, upper_body()) == []
-    assert checks([replace(d, joint_names=None) for d in turned], upper_body()) == [
-        ("order", ())
-    ]
+    unnamed = [replace(d, joint_names=None) for d in turned]
+    assert checks(unnamed, upper_body()) == [("order", ())]
 
 
 # -- time and events -------------------------------------------------------------------------
 
 
 def record(n=6, stretch=1.0, **events):
-    return [
-        Demonstration(
-            TIME * stretch,
-            np.sin(TIME + share)[:, None],
-            events={name: (at + share) * TIME[-1] for name, at in events.items()},
-        )
-        for share in np.linspace(-0.02, 0.02, n)
-    ]
+    found = []
+    for share in np.linspace(-0.02, 0.02, n):
+        at = {name: (when + share) * TIME[-1] for name, when in events.items()}
+        found.append(Demonstration(TIME * stretch, np.sin(TIME + share)[:, None], events=at))
+    return found
 
 
 @pytest.mark.parametrize(

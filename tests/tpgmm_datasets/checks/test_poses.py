@@ -13,17 +13,11 @@ TIME = np.arange(40) / 20
 
 def scene(places, turns=None):
     turns = np.tile([1.0, 0, 0, 0], (len(places), 1)) if turns is None else turns
-    path = np.tile([1.0, 0, 0, 0], (40, 1))
-    names = Poses(("hand",)).joint_names
-    return [
-        Demonstration(
-            TIME,
-            np.hstack((box(1, n) + 0.3 * np.cos(TIME)[:, None], path)),
-            {"cup": Frame(p, q)},
-            names,
-        )
-        for n, (p, q) in enumerate(zip(places, turns, strict=True))
-    ]
+    straight, names, shown = np.tile([1.0, 0, 0, 0], (40, 1)), Poses(("hand",)).joint_names, []
+    for n, (place, turn) in enumerate(zip(places, turns, strict=True)):
+        path = np.hstack((box(1, n) + 0.3 * np.cos(TIME)[:, None], straight))
+        shown.append(Demonstration(TIME, path, {"cup": Frame(place, turn)}, names))
+    return shown
 
 
 def found(items, robot=None):

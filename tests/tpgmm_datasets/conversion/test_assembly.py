@@ -100,27 +100,24 @@ def test_a_frame_at_an_event_that_was_not_found_is_an_error_with_the_episode(gri
 def test_events_alone_that_were_not_found_are_told_of_once(gripping):
     given = {"robot": ARM, "frames": {}, "events": {"close": "closing:gripper"}}
     for read in (load_lerobot, lambda *a, **k: list(iter_lerobot(*a, **k))):
-        with pytest.warns(
-            PlausibilityWarning, match=r"'close' .*in episodes 2 \(there 0"
-        ) as told:
+        message = r"'close' .*in episodes 2 \(there 0"
+        with pytest.warns(PlausibilityWarning, match=message) as caught:
             found = read(gripping, **given)
-        assert len(told) == 1 and told[0].filename == __file__
+        assert len(caught) == 1 and caught[0].filename == __file__
         assert [len(shown.events) for shown in found] == [1, 1, 0, 1, 1]
 
 
 @pytest.mark.parametrize("options", [{}, {"trim": 0.5}, {"rate": 20}])
 def test_start_and_end_are_where_a_link_is_first_and_last(root, options):
-    found = load_lerobot(
-        root, robot=ARM, frames={"start": "hand@start", "goal": "hand@end"}, **options
-    )
-    for shown in found:
+    frames = {"start": "hand@start", "goal": "hand@end"}
+    for shown in load_lerobot(root, robot=ARM, frames=frames, **options):
         torch.testing.assert_close(shown.frames["start"].position[:2], shown.joints[0])
         if not options.get("rate"):
             torch.testing.assert_close(shown.frames["goal"].position[:2], shown.joints[-1])
 
 
 @pytest.mark.parametrize(
-    "given, told",
+    "given, message",
     [
         ({"frames": {"cup": "@close"}}, "LINK@EVENT"),
         ({"frames": {"cup": "hand@a@b"}}, "LINK@EVENT"),
@@ -129,8 +126,8 @@ def test_start_and_end_are_where_a_link_is_first_and_last(root, options):
         ({"events": {"close": "closing:claw"}}, "no signal is called 'claw'"),
     ],
 )
-def test_links_and_events_that_are_none_are_refused(gripping, given, told):
-    with pytest.raises(DataError, match=told):
+def test_links_and_events_that_are_none_are_refused(gripping, given, message):
+    with pytest.raises(DataError, match=message):
         load_lerobot(gripping, robot=ARM, **given)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from tests.support.carrying import lagging_set
 from tests.support.lerobot_sets import (
@@ -42,19 +43,28 @@ def test_a_mapping_names_the_joints_that_are_called_otherwise(root):
     assert_equal(joints_of(found), expected)
 
 
+def rename_state(root, name):
+    """The measured joints under another name."""
+
+    def rename(table):
+        given = table.column_names
+        return table.rename_columns([name if n == "observation.state" else n for n in given])
+
+    def move(info):
+        info["features"][name] = info["features"].pop("observation.state")
+
+    change_table(root, DATA, rename)
+    change_info(root, move)
+
+
 def test_the_joint_feature_is_found_or_chosen(root):
     expected = joints_of(load_lerobot(root))
     action = joints_of(load_lerobot(root, joints="action"))
-    assert_equal([a[:-1] for a in action], [e[1:] for e in expected])
+    # an action is the next state, and the last is that of the end
+    assert_equal(action, [torch.cat((e[1:], e[-1:])) for e in expected])
     assert_equal(joints_of(load_lerobot(root, joints="commanded")), action)
     assert_equal(joints_of(load_lerobot(root, joints="measured")), expected)
-    rename = {"observation.state": "state"}
-    change_table(
-        root, DATA, lambda t: t.rename_columns([rename.get(n, n) for n in t.column_names])
-    )
-    change_info(
-        root, lambda i: i["features"].update(state=i["features"].pop("observation.state"))
-    )
+    rename_state(root, "state")
     assert_equal(joints_of(load_lerobot(root)), expected)
 
 
@@ -69,26 +79,14 @@ def test_what_is_held_is_found_in_measured_joints(tmp_path):
     assert (other.begin, other.end) == pytest.approx((hold.begin, hold.end), abs=0.06)
 
 
-def rename_state(root, name):
-    """The measured joints under another name."""
-    change_table(
-        root,
-        DATA,
-        lambda t: t.rename_columns(
-            [name if n == "observation.state" else n for n in t.column_names]
-        ),
-    )
-    change_info(
-        root, lambda i: i["features"].update({name: i["features"].pop("observation.state")})
-    )
-
-
 @pytest.mark.parametrize("name", ["observation.states.joint.position", "measured", "arm.qpos"])
 def test_commands_in_place_of_an_unusual_state_are_told_once(root, name):
     rename_state(root, name)
-    with pytest.warns(PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'") as told:
+    with pytest.warns(
+        PlausibilityWarning, match=f"commands.*{name}.*joints='{name}'"
+    ) as caught:
         commands = joints_of(load_lerobot(root))
-    assert len(told) == 1
+    assert len(caught) == 1
     assert_equal(joints_of(load_lerobot(root, joints="commanded")), commands)
     measured = joints_of(load_lerobot(root, joints=name))
     assert_equal([m[1:] for m in measured], [c[:-1] for c in commands])

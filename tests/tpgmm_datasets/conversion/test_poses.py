@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from tests.support.lerobot_sets import DATA, Arm, add_feature, change_table, set_column
 from tpgmm_datasets import DatasetError, FramePose, LinkPose, load_lerobot
@@ -20,19 +21,8 @@ POSITION = np.array([0.1, -0.2, 0.3])
 RPY = np.array([0.3, -0.5, 1.1])
 
 
-def euler_matrix(roll, pitch, yaw):
-    def turn(axis, angle):
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        matrix = np.eye(3)
-        matrix[[i, j], [i, j]] = math.cos(angle)
-        matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
-        return matrix
-
-    return turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
-
-
-QUATERNION = quaternions.from_matrix(torch.from_numpy(euler_matrix(*RPY)))
-YAW = quaternions.from_matrix(torch.from_numpy(euler_matrix(0, 0, RPY[2])))
+QUATERNION = quaternions.from_matrix(torch.tensor(Rotation.from_euler("xyz", RPY).as_matrix()))
+YAW = quaternions.exp(torch.tensor([0.0, 0.0, RPY[2]], dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
@@ -129,13 +119,9 @@ PLACES = {
 def test_a_table_gives_each_episode_its_own_pose(root, turn, place, moves, suffix, seed):
     rng, (columns, written) = np.random.default_rng(seed), TURNS[turn]
     shown = rng.uniform(-3, 3, size=(3, 1 + moves, 4))
+    scale = 1000 if place == "mm" else 1
     rows = [
-        [
-            episode,
-            0.05 * (1 + step),
-            *(1000 if place == "mm" else 1) * pose[:3],
-            *written(pose[3]),
-        ]
+        [episode, 0.05 * (1 + step), *scale * pose[:3], *written(pose[3])]
         for step in range(1 + moves)
         for episode, pose in enumerate(shown[::, step])
     ]
@@ -147,16 +133,12 @@ def test_a_table_gives_each_episode_its_own_pose(root, turn, place, moves, suffi
         frame = one.frames["cup"]
         assert frame.batch_shape == ((len(one),) if moves else ())
         # it stands still before the first and after the last
-        for found, (*position, angle) in zip(
-            frame[[0, -1]] if moves else [frame], poses, strict=True
-        ):
-            half = (
-                [math.cos(angle / 2), 0, 0, math.sin(angle / 2)] if columns else [1.0, 0, 0, 0]
-            )
+        ends = frame[[0, -1]] if moves else [frame]
+        for found, (*position, angle) in zip(ends, poses, strict=True):
+            half = angle / 2 if columns else 0.0
+            turn = torch.tensor([math.cos(half), 0, 0, math.sin(half)]).double()
             assert found.position.tolist() == pytest.approx(position)
-            assert abs(float(found.orientation @ torch.tensor(half).double())) == pytest.approx(
-                1
-            )
+            assert abs(float(found.orientation @ turn)) == pytest.approx(1)
 
 
 def test_frames_are_given_for_all_episodes_that_are_read(root):
@@ -168,24 +150,21 @@ def test_frames_are_given_for_all_episodes_that_are_read(root):
             assert one.frames["cup"].position.tolist() == frame.position.tolist()
     [last] = load_lerobot(root, frames={"cup": by_index}, episodes=[2])
     assert last.frames["cup"].position[0] == several[2].position[0]
-    for wrong, told in (
+    for wrong, said in (
         (several[:2], "got list of 2 Frame"),
         (several * 2, "got list of 6 Frame"),
         ({0: several[0], 1: several[1]}, "got dict of 2 Frame"),
         (by_index | {7: several[0]}, "got dict of 4 Frame"),
     ):
-        with pytest.raises(
-            DatasetError, match=rf"'cup' is .* one for each .* 0, 1, 2, .*{told}"
-        ):
+        message = rf"'cup' is .* one for each .* 0, 1, 2, .*{said}"
+        with pytest.raises(DatasetError, match=message):
             load_lerobot(root, frames={"cup": wrong})
 
 
 def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
     robot, turned = Arm("left_elbow", "right_elbow"), "+0.1,0,0.2,1.5707963"
-    read = load_lerobot(
-        root, robot=robot, frames={"hand": "hand@close", "cup": f"hand@close{turned}"}
-    )
-    for one in read:
+    frames = {"hand": "hand@close", "cup": f"hand@close{turned}"}
+    for one in load_lerobot(root, robot=robot, frames=frames):
         hand, cup = one.frames["hand"], one.frames["cup"].seen_from(one.frames["hand"])
         assert (hand.at, one.frames["cup"].at) == ("hand@close", None)
         assert cup.position.tolist() == pytest.approx([0.1, 0, 0.2])
@@ -193,7 +172,7 @@ def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
 
 
 @pytest.mark.parametrize(
-    ("make", "given", "told"),
+    ("make", "given", "said"),
     [
         (LinkPose.parse, "hand@close+0,0", "behind [+] is the object"),
         (LinkPose.parse, "hand@close+0,0,up", "behind [+] is"),
@@ -202,6 +181,6 @@ def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
         (partial(FramePose, "x", None), "wzyx", "rotation 'wzyx'"),
     ],
 )
-def test_offsets_and_rotations_that_are_none_are_refused(make, given, told):
-    with pytest.raises(DatasetError, match=told):
+def test_offsets_and_rotations_that_are_none_are_refused(make, given, said):
+    with pytest.raises(DatasetError, match=said):
         make(given)

@@ -27,10 +27,9 @@ def test_resampling_is_linear_and_keeps_what_coincides(root):
 
 
 def test_resampling_turns_quaternions_at_constant_speed(root):
-    angle = np.repeat([0.0, 1.0, 2.0], [12, 9, 15]) + 0.04 * np.concatenate(
-        [np.arange(n) for n in (12, 9, 15)]
-    )
-    half = angle / 2
+    lengths = (12, 9, 15)
+    steps = np.concatenate([np.arange(n) for n in lengths])
+    half = (np.repeat([0.0, 1.0, 2.0], lengths) + 0.04 * steps) / 2
     zero = np.zeros_like(half)
     # with the sign jumping from row to row, as recordings have it
     sign = np.where(np.arange(36) % 3, 1, -1)[:, None]

@@ -1,6 +1,7 @@
 """What all detectors share: hysteresis, and events that are left out and told of."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,9 +23,8 @@ def gripping(closes, opens=8.0, seed=0):
     if closes is not None:
         opening[(closes <= TIME) & (opens > TIME)] = 0.2
     opening += 0.01 * rng.normal(size=len(TIME))
-    return Demonstration(
-        TIME, np.stack([np.sin(TIME), opening], axis=1), joint_names=["elbow", "gripper"]
-    )
+    joints = np.stack([np.sin(TIME), opening], axis=1)
+    return Demonstration(TIME, joints, joint_names=["elbow", "gripper"])
 
 
 @pytest.mark.parametrize(
@@ -52,13 +52,13 @@ def test_what_is_found_with_confidence_is_an_event():
 
 def test_doubtful_events_are_left_out_and_named_in_one_warning():
     shown = [gripping(at, seed=n) for n, at in enumerate([2.0, None, 4.0, None, 3.0])]
-    with pytest.warns(PlausibilityWarning) as told:
+    with pytest.warns(PlausibilityWarning) as caught:
         found = find_events(shown, CLOSE)
     assert [sorted(d.events) for d in found] == [["close"], [], ["close"], [], ["close"]]
-    [message] = [str(warning.message) for warning in told]
+    [message] = [str(warning.message) for warning in caught]
     assert "'close'" in message
     assert "in demonstrations 1, 3 (there 0." in message
-    assert told[0].filename == __file__
+    assert caught[0].filename == __file__
 
 
 def test_events_that_were_spoilt_in_a_fifth_of_the_episodes_are_named():
@@ -68,9 +68,7 @@ def test_events_that_were_spoilt_in_a_fifth_of_the_episodes_are_named():
     assert len(check(found)) == 0
     spoilt = [2, 7, 11, 18]
     for n, at in zip(spoilt, [0.0, 0.0, 9.8, 0.0], strict=True):
-        found[n] = Demonstration(
-            TIME, found[n].joints, joint_names=found[n].joint_names, events={"close": at}
-        )
+        found[n] = replace(found[n], events={"close": at})
     [finding] = [f for f in check(found) if f.check == "events"]
     assert finding.episodes == tuple(spoilt)
 

@@ -63,9 +63,8 @@ def test_values_become_the_angles_that_lerobot_means(arm, file):
     stored = np.array([read_by_lerobot(row, MotorNormMode.RANGE_M100_100) for row in ticks])
     degrees = np.array([read_by_lerobot(row, MotorNormMode.DEGREES) for row in ticks])
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda _: stored))
-    found = np.concatenate(
-        [d.joints.numpy() for d in load_lerobot(arm, joints="arm", calibration=file)]
-    )
+    read = load_lerobot(arm, joints="arm", calibration=file)
+    found = np.concatenate([d.joints.numpy() for d in read])
     # LeRobot counts 4095 ticks to the turn where there are 4096
     expected = np.radians(degrees[:, :2]) * 4095 / 4096
     np.testing.assert_allclose(found[:, :2], expected, rtol=0, atol=1e-12)
@@ -77,12 +76,9 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
     rows = np.tile(np.linspace(0, 100, 36)[:, None], 6)
     names = [f"{side}_{name}" for side in ("left", "right") for name in NAMES]
     add_feature(root, "arms", rows, names)
-    [first, *_] = load_lerobot(
-        root,
-        joints="arms",
-        calibration={"left_": file, "right_": str(file)},
-        units={"right_gripper.pos": "raw"},
-    )
+    given = {"calibration": {"left_": file, "right_": str(file)}}
+    given["units"] = {"right_gripper.pos": "raw"}
+    [first, *_] = load_lerobot(root, joints="arms", **given)
     scales = [Scale.from_calibration(*ends) for ends in RANGES.values()][:2]
     scales.append(Scale.from_calibration(*RANGES["gripper"], stored=(0, 100)))
     scales = [*scales, *scales[:2], Scale(1.0)]
@@ -118,11 +114,11 @@ def test_values_in_degrees_and_units_for_all_are_refused(arm, file):
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda values: 1.2 * values))
     with pytest.raises(DatasetError, match=r"goes from -120 to .*use_degrees.*units='deg'"):
         load_lerobot(arm, joints="arm", calibration=file)
-    for options, told in (
+    for options, message in (
         ({"calibration": file, "units": "deg"}, "give one of them"),
         ({"calibration": file.with_name("leg.json")}, r"cannot be read: .*leg\.json"),
         ({"calibration": 3}, "several by prefix; got"),
         ({"calibration": {"left_": None}}, "several by prefix; got"),
     ):
-        with pytest.raises(DatasetError, match=told):
+        with pytest.raises(DatasetError, match=message):
             load_lerobot(arm, joints="arm", **options)

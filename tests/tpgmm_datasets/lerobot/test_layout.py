@@ -20,14 +20,12 @@ EXTRA = "data/chunk-000/file-007.parquet"
 INFO = ("meta/info.json",)
 
 
-def listed_twice(root):
-    index = pa.array([0, 1, 1])
-    change_table(root, EPISODES, lambda table: set_column(table, "episode_index", index))
+def put(file, column, values):
+    array = pa.array(values)
+    return lambda root: change_table(root, file, lambda t: set_column(t, column, array))
 
 
-def huge(file, column):
-    values = pa.array([0, 2**62, 1])
-    return lambda root: change_table(root, file, lambda t: set_column(t, column, values))
+HUGE, FROM = [0, 2**62, 1], "dataset_from_index"
 
 
 def wide(root):
@@ -46,7 +44,7 @@ def test_an_edit_of_the_metadata_is_noticed_by_the_data_files(root):
         ("metadata", in_info(total_episodes=4), INFO),
         ("metadata", in_info(total_frames=35), INFO),
         ("metadata", lambda root: shutil.copy(root / DATA, root / EXTRA), (EXTRA,)),
-        ("duplicates", listed_twice, (None, 1)),
+        ("duplicates", put(EPISODES, "episode_index", [0, 1, 1]), (None, 1)),
         ("missing", lambda root: (root / EPISODES).unlink(), ("meta/episodes",)),
         ("missing", lambda root: (root / "meta/info.json").unlink(), ()),
         ("", lambda root: (root / "meta/info.json").write_text("{"), INFO),
@@ -59,8 +57,8 @@ def test_an_edit_of_the_metadata_is_noticed_by_the_data_files(root):
         ("", in_info(data_path=7), INFO),
         ("", in_info(fps=10**400), INFO),
         ("", lambda root: (root / "meta/info.json").write_text("[" * 100_000), INFO),
-        ("", huge(EPISODES, "data/chunk_index"), (f"{EPISODES}", None, "data/chunk_index")),
-        ("", huge(EPISODES, "dataset_from_index"), (EPISODES, None, "dataset_from_index")),
+        ("", put(EPISODES, "data/chunk_index", HUGE), (EPISODES, None, "data/chunk_index")),
+        ("", put(EPISODES, FROM, HUGE), (EPISODES, None, FROM)),
         ("", wide, (*INFO, None, "observation.state")),
     ],
 )

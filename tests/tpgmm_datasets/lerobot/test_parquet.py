@@ -33,17 +33,12 @@ def test_another_data_path_and_list_columns_are_read(root):
     lists = pa.list_(pa.float64())
     table = pq.read_table(root / DATA).replace_schema_metadata(None)
     column = table["observation.state"].combine_chunks().cast(lists)
-    pq.write_table(
-        set_column(table, "observation.state", column), root / "data/all/0-0.parquet"
-    )
+    table = set_column(table, "observation.state", column)
+    pq.write_table(table, root / "data/all/0-0.parquet")
     (root / DATA).unlink()
     template = "data/all/{chunk_index}-{file_index}.parquet"
     change_info(root, lambda info: info.update(data_path=template))
     assert_equal(joints_of(load_lerobot(root)), expected)
-
-
-def cut_file(root):
-    (root / DATA).write_bytes((root / DATA).read_bytes()[:-200])
 
 
 def test_a_missing_file_can_be_relaxed(root, tmp_path):
@@ -55,10 +50,14 @@ def test_a_missing_file_can_be_relaxed(root, tmp_path):
 
 @pytest.mark.parametrize(
     "damage",
-    [lambda at: (at / DATA).unlink(), lambda at: (at / DATA).write_bytes(b""), cut_file],
+    [
+        lambda file: file.unlink(),
+        lambda file: file.write_bytes(b""),
+        lambda file: file.write_bytes(file.read_bytes()[:-200]),
+    ],
 )
 def test_a_file_that_is_missing_or_cut_off_is_named(root, damage):
-    damage(root)
+    damage(root / DATA)
     assert_refused(root, "missing", DATA)
 
 

@@ -16,9 +16,8 @@ from tpgmm_torch.exceptions import DataError, ShapeError
 def test_tables_and_lerobot_sets_give_them_back(tmp_path):
     shown = wipes()
     table = demonstrations_from_frame(demonstrations_to_frame(shown))
-    stored = load_lerobot(
-        save_lerobot(shown, tmp_path / "wipes", fps=50, task="wipe", dtype="float64")
-    )
+    given = {"fps": 50, "task": "wipe", "dtype": "float64"}
+    stored = load_lerobot(save_lerobot(shown, tmp_path / "wipes", **given))
     for original, *others in zip(shown, table, stored, strict=True):
         for other in others:
             assert torch.equal(other.wrenches["hand"], original.wrenches["hand"])

@@ -12,15 +12,8 @@ from lerobot_env_bimanual.metaworld.hand import metaworld_operators, metaworld_r
 from lerobot_env_bimanual.metaworld.tasks import TASKS, TUNED, difficulty
 from tests.support.reaching import reaching
 from tpgmm_evaluation.cells import Cell, Results
-from tpgmm_evaluation.metaworld import recordings
+from tpgmm_evaluation.metaworld import learners, recordings
 from tpgmm_evaluation.metaworld.__main__ import report
-from tpgmm_evaluation.metaworld.learners import (
-    LEARNERS,
-    TaskParameterized,
-    drop_slow,
-    slow_down,
-    switches,
-)
 from tpgmm_evaluation.metaworld.nearness import Nearness
 from tpgmm_evaluation.metaworld.recordings import (
     demonstration_seeds,
@@ -64,7 +57,7 @@ def episodes_of(cells):
 def test_groups_are_all_tasks_and_two_halves_that_share_none():
     assert set(GROUPS["tuned half"]).isdisjoint(GROUPS["held half"])
     assert sorted((*GROUPS["tuned half"], *GROUPS["held half"])) == list(TASKS)
-    assert set(LOOKS) == set(LEARNERS)
+    assert set(LOOKS) == set(learners.LEARNERS)
 
 
 def test_the_summary_has_means_over_tasks_with_intervals_and_every_seed():
@@ -204,21 +197,21 @@ def test_the_expert_is_asked_for_more_where_it_fails(
 
 
 def test_switches_are_where_the_gripper_jumps():
-    assert switches(reaching(0).references) == [30]
+    assert learners.switches(reaching(0).references) == [30]
 
 
 def test_events_are_the_switches_that_all_demonstrations_have():
     once, twice = reaching(0), reaching(1)
     twice.references[50:, -1] = 1.0
-    first, second = slow_down([once, twice], 1.0)
+    first, second = learners.slow_down([once, twice], 1.0)
     assert first.events == second.events == {"switch 1": pytest.approx(30 / 80)}
     once.references[30:, -1] = 1.0  # never closed: nothing is common
-    assert not any(one.events for one in slow_down([once, twice], 0.5))
+    assert not any(one.events for one in learners.slow_down([once, twice], 0.5))
 
 
 def test_fingers_are_told_later_where_the_hand_is_slower():
     shown = reaching(0)
-    [one] = slow_down([shown], 0.5)
+    [one] = learners.slow_down([shown], 0.5)
     assert float(one.time[-1]) == pytest.approx(59 / 80 / 0.5)
     # the hand takes twice as long to where it was 0.19 s after the switch, fingers do not
     assert one.events["switch 1"] == pytest.approx(2 * 30 / 80 + 0.19, abs=0.5 / 80 / 0.5)
@@ -228,10 +221,10 @@ def test_fingers_are_told_later_where_the_hand_is_slower():
 
 def test_second_tries_are_not_learned_from():
     episodes = [reaching(seed, length) for seed, length in enumerate((80, 60, 84, 85, 60))]
-    assert drop_slow(episodes, longest=1.4) == [episodes[i] for i in (0, 1, 2, 4)]
-    assert drop_slow(episodes, longest=1.3) == [episodes[i] for i in (1, 4)]
-    assert drop_slow(episodes[:1], longest=1.4) == episodes[:1]
-    learner = TaskParameterized()
+    assert learners.drop_slow(episodes, longest=1.4) == [episodes[i] for i in (0, 1, 2, 4)]
+    assert learners.drop_slow(episodes, longest=1.3) == [episodes[i] for i in (1, 4)]
+    assert learners.drop_slow(episodes[:1], longest=1.4) == episodes[:1]
+    learner = learners.TaskParameterized()
     few, all_of_them = (learner.fit(some, 0).policy for some in (episodes[:3], episodes[:4]))
     most = replace(learner, longest=2.0).fit(episodes[:4], 0).policy
     means = [
@@ -244,10 +237,10 @@ def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
     shown = reaching(1)
     for step in (1, 40, 41, 58, 59):
         shown.references[step:, -1] = 1 - shown.references[step:, -1]
-    assert switches(shown.references) == [1, 30, 40, 41, 58, 59]
-    [one] = slow_down([shown], 1.0)
+    assert learners.switches(shown.references) == [1, 30, 40, 41, 58, 59]
+    [one] = learners.slow_down([shown], 1.0)
     assert [round(80 * instant) for instant in one.events.values()] == [30, 40]
-    TaskParameterized().fit([shown], 0)
+    learners.TaskParameterized().fit([shown], 0)
 
 
 def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
@@ -260,9 +253,9 @@ def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
         one.references[:, 2] = 0.2 + 0.05 * np.sin(2 * np.pi * clock / 24)
         shown.append(one)
     for warping, largest in (({}, 0.015), ({"max_slope": 1}, 0.04)):
-        learner = TaskParameterized()
+        learner = learners.TaskParameterized()
         learner = replace(learner, warping=learner.warping | warping)
-        aligned = learner.align(slow_down(shown, learner.pace), metaworld_robot())
+        aligned = learner.align(learners.slow_down(shown, learner.pace), metaworld_robot())
         heights = torch.stack([one.joints[:, 2] for one in aligned])
         assert largest / 3 < float(heights.std(0).mean()) < largest
 
@@ -288,18 +281,18 @@ def test_the_prior_is_what_its_formula_says_and_parts_the_gripper_from_the_hand(
 def test_one_demonstration_is_enough_to_reach_another_goal():
     """Nothing but the prior can say that the end belongs to the goal and not to the world."""
     shown, new = reaching(1), reaching(2)
-    actor = TaskParameterized().fit([shown], 0)
+    actor = learners.TaskParameterized().fit([shown], 0)
     actor.begin(new.observed[:1])
     goal = new.references[-1, :3]
     assert np.linalg.norm(actor.act(0, 10**6, new.observed[-1])[:3] - goal) < 0.02
-    blind = TaskParameterized(nearness=None).fit([shown], 0)
+    blind = learners.TaskParameterized(nearness=None).fit([shown], 0)
     blind.begin(new.observed[:1])
     assert np.linalg.norm(blind.act(0, 10**6, new.observed[-1])[:3] - goal) > 0.02
 
 
 def test_the_gripper_switches_as_it_was_shown():
     shown, new = [reaching(i) for i in (1, 2, 3)], reaching(4)
-    actor = TaskParameterized().fit(shown, 0)
+    actor = learners.TaskParameterized().fit(shown, 0)
     actor.begin(new.observed[:1])
     plan = np.array([actor.act(0, step, new.observed[0])[3] for step in range(90)])
     # from all to nothing within two steps, and no further; as an arm's joint it took five
@@ -309,8 +302,8 @@ def test_the_gripper_switches_as_it_was_shown():
 
 def test_reading_the_hand_at_every_step_gives_the_same_references_if_it_follows():
     shown, new = [reaching(i) for i in (1, 2, 3)], reaching(4)
-    plan = TaskParameterized().fit(shown, 0)
-    closed = TaskParameterized(clock="even").fit(shown, 0)
+    plan = learners.TaskParameterized().fit(shown, 0)
+    closed = learners.TaskParameterized(clock="even").fit(shown, 0)
     for actor in (plan, closed):
         actor.begin(new.observed[:1])
     for step in range(20):

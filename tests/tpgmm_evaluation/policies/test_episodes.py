@@ -29,12 +29,8 @@ def cut_windows(episodes, *arguments):
 def test_episodes_are_read_as_they_were_written(tmp_path):
     rng = np.random.default_rng(0)
     motions = [
-        Demonstration(
-            np.arange(length) / FPS,
-            rng.normal(size=(length, 3)),
-            {"bottle": Frame(rng.normal(size=3))},
-        )
-        for length in (12, 15, 9)
+        Demonstration(np.arange(n) / FPS, rng.normal(size=(n, 3)), {"bottle": Frame(place)})
+        for n, place in zip((12, 15, 9), rng.normal(size=(3, 3)), strict=True)
     ]
     actions = [motion.joints + 1 for motion in motions]
     root = save_lerobot(motions, tmp_path / "set", fps=FPS, task="reach", actions=actions)
@@ -60,18 +56,9 @@ def test_windows_stay_in_their_episode_at_the_lower_rate():
     assert batch[OBS_STATE][..., 0].tolist() == seen
     assert (batch[OBS_ENV_STATE][..., 0] - 0.25).tolist() == seen
     # the reference at the end of each step
-    assert (batch[ACTION][..., 0] - 0.5).tolist() == [
-        [1, 3, 5],
-        [6, 7, 7],
-        [101, 103, 105],
-        [104, 105, 105],
-    ]
-    assert batch["action_is_pad"].tolist() == [
-        [False, False, False],
-        [False, True, True],
-        [False, False, False],
-        [False, True, True],
-    ]
+    wanted = [[1, 3, 5], [6, 7, 7], [101, 103, 105], [104, 105, 105]]
+    assert (batch[ACTION][..., 0] - 0.5).tolist() == wanted
+    assert batch["action_is_pad"].tolist() == [[False] * 3, [False, True, True]] * 2
 
 
 def test_without_a_history_observations_have_no_time_axis():
@@ -99,6 +86,5 @@ def test_the_common_clock_removes_differences_in_time():
     assert [float(rows[0, 0]) for _, rows, _ in training] == pytest.approx([1.0, 1.1, 0.9])
     state, action = training.columns[OBS_STATE], training.columns[ACTION]
     torch.testing.assert_close(action, state + 0.01, atol=1e-5, rtol=0)
-    assert training.elapsed_time()[: max(lengths)].tolist() == pytest.approx(
-        [i / FPS for i in range(max(lengths))]
-    )
+    elapsed = training.elapsed_time()[: max(lengths)]
+    np.testing.assert_allclose(elapsed, np.arange(max(lengths)) / FPS, rtol=1e-6)

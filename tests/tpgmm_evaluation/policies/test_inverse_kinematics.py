@@ -72,9 +72,8 @@ def test_a_way_is_followed_as_well_as_the_generator_of_the_skill_follows_it() ->
     steps = int(demonstration.events["grasp"] * 25)
     shown = demonstration.joints[:steps]
     poses = poses_at(skill.robot, shown)
-    joints = follow_poses(
-        skill.robot, poses, shown[0], rate=25, posture=skill.neutral_posture()
-    )
+    posture = skill.neutral_posture()
+    joints = follow_poses(skill.robot, poses, shown[0], rate=25, posture=posture)
     assert joints.shape == shown.shape
     reached = skill.robot.state(joints)
     for link in HANDS:
@@ -112,9 +111,8 @@ class TestMissing:
     def test_poses_out_of_reach_are_named(self) -> None:
         way = torch.zeros(30, 3, dtype=torch.float64)
         way[:, 0] = torch.linspace(0, 1.5, 30)
-        with pytest.warns(
-            PlausibilityWarning, match=r"'l_hand' is .* mm, .* from pose 29 of 30"
-        ):
+        message = r"'l_hand' is .* mm, .* from pose 29 of 30"
+        with pytest.warns(PlausibilityWarning, match=message):
             joints = follow_poses(self.robot, self.poses(way), self.start, rate=10)
         assert joints.isfinite().all()
 
@@ -134,15 +132,12 @@ class TestMissing:
         start[joint] = robot.lower[joint] - beyond
         nearest = start.clamp(robot.lower, robot.upper)
         poses = poses_at(robot, wanted)
-        told = f"'{robot.joint_names[joint]}' at .* its limit {nearest[joint]:.4g}"
-        with pytest.warns(PlausibilityWarning, match=told) as warned:
+        message = f"'{robot.joint_names[joint]}' at .* its limit {nearest[joint]:.4g}"
+        with pytest.warns(PlausibilityWarning, match=message) as warned:
             found = reach(robot, poses, start, tolerance=1e-5)
         assert len(warned) == 1
         torch.testing.assert_close(found, reach(robot, poses, nearest, tolerance=1e-5))
-        held = {
-            link: Frame(p.position.expand(9, 3), p.orientation.expand(9, 4))
-            for link, p in poses.items()
-        }
+        held = {link: pose.expand((9,)) for link, pose in poses.items()}
         with pytest.warns(PlausibilityWarning):
             way = follow_poses(robot, held, start, rate=50)
         assert way[0].equal(nearest)
@@ -183,17 +178,20 @@ class TestRefusing:
             reach(still, poses_at(robot, start), np.zeros(7))
 
     def test_links_and_shapes_that_do_not_fit(self) -> None:
-        one, many = Frame([0.2, 0.1, 0.1]), Frame(np.zeros((4, 3)))
-        with pytest.raises(UnknownNameError, match="link 'nose'"):
-            reach(self.robot, {"nose": one}, self.start)
-        with pytest.raises(ShapeError, match="one pose"):
-            reach(self.robot, {"l_hand": many}, self.start)
-        with pytest.raises(ShapeError, match="same number of poses"):
-            follow_poses(self.robot, {"l_hand": many, "r_hand": one}, self.start, rate=10)
-        with pytest.raises(ShapeError, match="same number of poses"):
-            follow_poses(self.robot, {"l_hand": many[:0]}, self.start, rate=10)
-        with pytest.raises(ShapeError, match="one start"):
-            follow_poses(self.robot, {"l_hand": many}, np.zeros((2, 7)), rate=10)
+        one, many, starts = Frame([0.2, 0.1, 0.1]), Frame(np.zeros((4, 3))), np.zeros((2, 7))
+        for poses, error, message in (
+            ({"nose": one}, UnknownNameError, "link 'nose'"),
+            ({"l_hand": many}, ShapeError, "one pose"),
+        ):
+            with pytest.raises(error, match=message):
+                reach(self.robot, poses, self.start)
+        for poses, start, message in (
+            ({"l_hand": many, "r_hand": one}, self.start, "same number of poses"),
+            ({"l_hand": many[:0]}, self.start, "same number of poses"),
+            ({"l_hand": many}, starts, "one start"),
+        ):
+            with pytest.raises(ShapeError, match=message):
+                follow_poses(self.robot, poses, start, rate=10)
 
     def test_joints_that_others_mimic(self) -> None:
         with pytest.raises(DataError, match="'elbow' moves several links by mimicry"):

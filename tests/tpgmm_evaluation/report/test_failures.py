@@ -15,16 +15,9 @@ from tpgmm_evaluation.report.failures import (
 from tpgmm_evaluation.report.tables import episode_table
 from tpgmm_evaluation.settings import Settings
 
-BOTTLE, CARRY, ALOHA = (
-    benchmark(name) for name in ("bottle_shaking", "carry_and_put", "aloha_state")
-)
-GOOD = {
-    "grasp_mm": 1.0,
-    "grasp_deg": 1.0,
-    "lift_mm": 80.0,
-    "frequency_error": 0.0,
-    "amplitude_error": 0.0,
-}
+BOTTLE, CARRY, ALOHA = map(benchmark, ("bottle_shaking", "carry_and_put", "aloha_state"))
+GOOD = {"grasp_mm": 1.0, "grasp_deg": 1.0, "lift_mm": 80.0}
+GOOD |= {"frequency_error": 0.0, "amplitude_error": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,7 @@ import pandas as pd
 import pytest
 
 from tests.support.comparison import RESULTS, result
-from tpgmm_evaluation.report.tables import (
-    cell_table,
-    count_demonstrations,
-    episode_table,
-    wilson,
-    write_table,
-)
+from tpgmm_evaluation.report import tables
 from tpgmm_torch.exceptions import DataError
 
 
@@ -32,17 +26,17 @@ from tpgmm_torch.exceptions import DataError
     ],
 )
 def test_wilson_gives_published_values(successes, trials, confidence, expected):
-    assert wilson(successes, trials, confidence) == pytest.approx(expected, abs=5e-5)
+    assert tables.wilson(successes, trials, confidence) == pytest.approx(expected, abs=5e-5)
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (3, 2), (-1, 2)])
 def test_wilson_refuses_what_is_no_proportion(successes, trials):
     with pytest.raises(DataError, match="no proportion"):
-        wilson(successes, trials)
+        tables.wilson(successes, trials)
 
 
 def test_tables_have_a_row_for_each_cell_and_each_episode():
-    cells, episodes = cell_table(RESULTS), episode_table(RESULTS)
+    cells, episodes = tables.cell_table(RESULTS), tables.episode_table(RESULTS)
     assert len(cells) == 6
     assert len(episodes) == 120
     row = cells.iloc[5]
@@ -58,8 +52,8 @@ def test_tables_have_a_row_for_each_cell_and_each_episode():
 def test_results_go_through_a_file_as_they_are(tmp_path):
     other = result("tpgmm", 5, 4, env="carry_and_put")
     other["episodes"] = [{"seed": 9, "success": True, "put_mm": 0.5}]
-    episodes = episode_table([*RESULTS, other])
-    write_table(episodes, tmp_path / "results")
+    episodes = tables.episode_table([*RESULTS, other])
+    tables.write_table(episodes, tmp_path / "results")
     read = pd.read_parquet(tmp_path / "results.parquet")
     pd.testing.assert_frame_equal(read, episodes)
     last = read.iloc[-1]
@@ -77,6 +71,6 @@ def test_demonstrations_are_counted_by_seed(tmp_path):
         folder = tmp_path / "episodes" / f"s{seed}"
         folder.mkdir(parents=True)
         (folder / "summary.json").write_text(json.dumps({"successes": successes}))
-    table = count_demonstrations(tmp_path)
+    table = tables.count_demonstrations(tmp_path)
     assert table.to_dict("list") == {"seed": [2, 10], "tried": [1, 2], "succeed": [1, 1]}
-    assert count_demonstrations(tmp_path / "none").empty
+    assert tables.count_demonstrations(tmp_path / "none").empty

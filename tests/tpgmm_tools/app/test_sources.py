@@ -28,9 +28,8 @@ def test_a_zipped_data_set_is_read_with_the_robots_joints(archive, bottles):
     assert len(read) == 2
     for one, other in zip(read, bottles, strict=True):
         np.testing.assert_allclose(one.joints, other.joints, atol=1e-6)
-        np.testing.assert_allclose(
-            one.frames["bottle"].position, other.frames["bottle"].position, atol=1e-6
-        )
+        places = (d.frames["bottle"].position for d in (one, other))
+        np.testing.assert_allclose(*places, atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -39,9 +38,7 @@ def test_tables_are_read_one_demonstration_each_or_several(tmp_path, bottles, su
     write_table(demonstrations_to_frame(bottles[:1]).drop(columns="episode"), one)
     write_table(demonstrations_to_frame(bottles), both)
     read = sources.read_uploads([one, both])
-    assert [len(demonstration) for demonstration in read] == [
-        len(bottles[0]), len(bottles[1]), len(bottles[0])
-    ]  # fmt: skip
+    assert [len(d) for d in read] == [len(d) for d in (*bottles, bottles[0])]
     np.testing.assert_allclose(read[-1].joints, bottles[0].joints)
 
 

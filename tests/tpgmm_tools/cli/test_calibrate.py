@@ -75,8 +75,8 @@ def test_what_the_options_get_wrong_is_said_and_nothing_is_written(waving, writt
         assert said in refusal(*arguments, *options)
     other = json.loads(before) | {"joints": ["a", "b"]}
     write_cell(other, written)
-    told = refusal(*arguments, "--units", "deg", "--hand", f"{HAND}={CUBE}")
-    assert "is of a robot with joints ['a', 'b']" in told
+    message = refusal(*arguments, "--units", "deg", "--hand", f"{HAND}={CUBE}")
+    assert "is of a robot with joints ['a', 'b']" in message
     assert json.loads(written.read_text()) == other
     assert not (tmp_path / "none").exists()
 
@@ -93,5 +93,5 @@ def test_a_camera_is_calibrated_by_a_folder_of_pictures(written, tmp_path):
     assert found.cameras["wrist"].key == "observation.images.wrist"
     assert found.cameras["wrist"].link == HAND
     assert list(found.objects) == ["cup"]
-    told = refusal("calibrate", "camera", tmp_path / "none.mp4", *given)
-    assert "none.mp4 is no folder of pictures and no video" in told
+    message = refusal("calibrate", "camera", tmp_path / "none.mp4", *given)
+    assert "none.mp4 is no folder of pictures and no video" in message

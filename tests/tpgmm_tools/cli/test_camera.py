@@ -28,8 +28,8 @@ def test_it_writes_the_pages_and_says_what_the_cell_file_says(tmp_path):
 
 
 def test_numbers_of_a_cube_that_are_none_are_an_error_of_one_line():
-    told = refusal("camera", "print", "--cube", "10;11")
-    assert told == "tpgmm: --cube has numbers, as 10,11,12,13,14, got ['10;11']"
+    said = refusal("camera", "print", "--cube", "10;11")
+    assert said == "tpgmm: --cube has numbers, as 10,11,12,13,14, got ['10;11']"
 
 
 def test_tags_are_those_that_are_usual():
@@ -49,8 +49,5 @@ from tpgmm_tools.cli import main
 main()
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert (
-        done.stderr
-        == "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
-    )
+    said = "tpgmm: poses from cameras need OpenCV: pip install 'tpgmm-torch[vision]'\n"
+    assert (done.returncode, done.stderr) == (2, said)

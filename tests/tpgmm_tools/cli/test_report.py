@@ -35,9 +35,8 @@ def test_errors_are_those_of_models_that_were_learned_without(example):
     alone.fit([shown[0], shown[1], shown[3]])
     [trajectory] = alone.predict([skills.Situation.of(shown[2], shown[2].time)])
     error = pose_errors(trajectory, shown[2], alone.kinematics_, "l_hand", "grasp")
-    assert one.errors["l_hand", "grasp"] == pytest.approx(
-        (float(error.position), float(error.angle)), rel=1e-6, abs=1e-9
-    )
+    wanted = float(error.position), float(error.angle)
+    assert one.errors["l_hand", "grasp"] == pytest.approx(wanted, rel=1e-6, abs=1e-9)
     assert one.novelty == pytest.approx(float(trajectory.novelty))
 
 
@@ -48,18 +47,11 @@ def test_the_page_has_errors_candidates_limits_and_the_motion(example):
     text = output("report", folder / "model", *arguments)
     page = (folder / "model.html").read_text(encoding="utf-8")
     assert text.endswith(f"in {folder / 'model.html'}\n")
-    titles = re.findall("<h2>(.*?)</h2>", page)
-    assert titles == [
-        "At a glance",
-        "What was understood",
-        "The motion",
-        "How exact it is",
-        "Who decides, and when",
-        "Joints and their limits",
-        "Each demonstration",
-        "Where it fails",
-        "How it was learned",
-    ]
+    assert re.findall("<h2>(.*?)</h2>", page) == [
+        "At a glance", "What was understood", "The motion", "How exact it is",
+        "Who decides, and when", "Joints and their limits", "Each demonstration",
+        "Where it fails", "How it was learned",
+    ]  # fmt: skip
     assert "Events: none." in page and "<td>l_hand<td>grasp<td>" in page
     robot = model.kinematics_
     for name, speed in zip(robot.joint_names, robot.velocity, strict=True):
@@ -100,9 +92,8 @@ def test_joints_alone_have_no_limits_and_no_picture(tmp_path):
 def test_what_cannot_be_left_out_is_an_error(example, tmp_path):
     folder, _, shown = example
     save_lerobot(shown[:2], tmp_path / "two", fps=20, task="shake")
-    assert "to leave one out takes 3 demonstrations, there are 2" in refusal(
-        "report", folder / "model", "--dataset", tmp_path / "two", "--alignment", "none"
-    )
-    assert "there are 4 situations" in refusal(
-        "report", folder / "model", "--dataset", folder / "dataset", "--situation", 7
-    )
+    for data, options, said in (
+        (tmp_path / "two", ("--alignment", "none"), "takes 3 demonstrations, there are 2"),
+        (folder / "dataset", ("--situation", 7), "there are 4 situations"),
+    ):
+        assert said in refusal("report", folder / "model", "--dataset", data, *options)

@@ -42,11 +42,11 @@ def test_reproductions_of_a_data_set_are_those_of_the_model(
 
 
 def test_a_frame_that_the_data_set_does_not_tell_is_asked_for(dataset, bottle_model, tmp_path):
-    told = refusal(
+    said = refusal(
         "reproduce", bottle_model[0], "--dataset", dataset, "--frame", "cup=observation."
         "environment_state[0:7]", "--out", tmp_path / "r.csv",
     )  # fmt: skip
-    assert "frame 'bottle' is not in" in told and "--frame bottle=LINK@EVENT" in told
+    assert "frame 'bottle' is not in" in said and "--frame bottle=LINK@EVENT" in said
     assert not (tmp_path / "r.csv").exists()
 
 
@@ -55,10 +55,9 @@ def test_reproduce_takes_situations_from_a_file(bottle_model, tmp_path):
     situations = BottleShaking().situations(2)
     items = []
     for one in situations:
-        parts = {
-            k: getattr(one.frames["bottle"], k).tolist() for k in ("position", "orientation")
-        }
-        items.append({"joints": one.joints.tolist(), "frames": {"bottle": parts}})
+        bottle = one.frames["bottle"]
+        pose = {k: getattr(bottle, k).tolist() for k in ("position", "orientation")}
+        items.append({"joints": one.joints.tolist(), "frames": {"bottle": pose}})
     file.write_text(json.dumps(items))
     output("reproduce", bottle_model[0], "--situations", file, "--out", out)
     skill = load_model(bottle_model[0]).skill

@@ -16,8 +16,8 @@ def test_models_are_joined(tmp_path):
     assert lines[0] == "  2.00 s  end of pick: held, 2 retries" and str(out) in lines[-1]
     assert [gate.until for gate in load(out).gates] == [("held",), ("arrived",)]
     assert load(out).timeout == 1.5
-    told = refusal("sequence", f"{tmp_path}/lift, {tmp_path}/home", "--out", tmp_path / "no")
-    assert "lift is not a saved model" in told and not (tmp_path / "no").exists()
+    said = refusal("sequence", f"{tmp_path}/lift, {tmp_path}/home", "--out", tmp_path / "no")
+    assert "lift is not a saved model" in said and not (tmp_path / "no").exists()
 
 
 def test_a_sequence_is_one_policy(dataset, bottle_model, tmp_path):

@@ -51,8 +51,7 @@ def test_view_takes_situations_from_a_file(demo, tmp_path):
     [
         ((".", "--object", "bottle"), "a shape is box:X,Y,Z"),
         ((".", "--object", "mug=sphere:0.1"), "there are shapes for ['mug']"),
-        ((".", "--format", "rerun", "--out", "m.html"), "--out ends in .rrd"),
-        ((".", "--format", "rerun", "--live"), "give one of them"),
+        ((".", "--format", "rerun"), "written as one HTML file, not as 'rerun'"),
         (("model",), "give --dataset DATASET or --situations FILE.json"),
         ((".", "--situation", 2), "there are 2 situations, counted from 0; got --situation 2"),
         ((".", "--out", "motion.mp4"), "--out ends in .html, got 'motion.mp4'"),

@@ -14,11 +14,8 @@ TURN = "grasp orientation error [deg]"
 
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory):
-    out = tmp_path_factory.mktemp("experiment")
-    stages = []
-    run = BottleExperiment(
-        out, n_situations=10, skill=BottleShaking(rate=50), report=stages.append
-    )
+    out, stages, skill = tmp_path_factory.mktemp("experiment"), [], BottleShaking(rate=50)
+    run = BottleExperiment(out, n_situations=10, skill=skill, report=stages.append)
     return out, run.run(), stages
 
 
@@ -64,9 +61,7 @@ def test_the_experiment_writes_all_its_files(experiment):
     assert len(stages) == BottleExperiment.STAGES
     written = json.loads((out / "metrics.json").read_text())
     assert written["rows"].keys() == metrics["rows"].keys()
-    for name in (
-        f"figure_{number}.{form}" for number in (3, 4, 5, 6) for form in ("png", "pdf")
-    ):
+    for name in (f"figure_{n}.{form}" for n in (3, 4, 5, 6) for form in ("png", "pdf")):
         assert (out / name).stat().st_size > 10_000
     assert (out / "dataset" / "meta" / "info.json").is_file()
     assert (out / "model" / "model.safetensors").is_file()

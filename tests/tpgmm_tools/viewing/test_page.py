@@ -14,17 +14,11 @@ from tests.support.browser import draws, yellow
 from tests.support.recordings import Recording
 from tests.support.worlds import upper_body
 from tpgmm_control.loop.rollout import rollout
-from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
+from tpgmm_tools.viewing import LiveView, write_motion
 from tpgmm_torch import Frame, Situation
 from tpgmm_torch.exceptions import DependencyError
 
 pytestmark = pytest.mark.slow
-
-
-def reproduce(model, situation):
-    """Reproduce within the robot's bounds, led in from the start posture."""
-    [trajectory] = rollout(model.skill, [situation], bounds="robot", blend=1.0)
-    return trajectory
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +58,10 @@ def test_links_and_objects_are_where_the_reproduction_has_them(motion):
     assert len(recording.props("/covariance/r_hand")["batched_positions"]) > 20
 
 
-@pytest.mark.parametrize(
-    ("write", "package", "extra"),
-    [(write_motion, "viser", "cli"), (write_rerun, "rerun", "rerun")],
-)
-def test_without_a_package_the_error_names_the_extra(
-    monkeypatch, tmp_path, write, package, extra
-):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(DependencyError, match=rf"tpgmm-torch\[{extra}\]"):
-        write(tmp_path / "motion", skills.hands(), skills.new_handling()[0])
+def test_without_viser_the_error_names_the_extra(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[cli\]"):
+        write_motion(tmp_path / "motion", skills.hands(), skills.new_handling()[0])
 
 
 def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
@@ -108,7 +96,7 @@ def test_live_an_object_that_is_moved_changes_the_reproduction(capsys):
             (lambda: view.show(1), other),
         ):
             change()
-            trajectory = reproduce(model, expected)
+            [trajectory] = rollout(model.skill, [expected], bounds="robot", blend=1.0)
             torch.testing.assert_close(view.drawing.trajectory.joints, trajectory.joints)
         start = time.monotonic()
         view.run(0.3)

@@ -49,14 +49,14 @@ def test_every_link_of_the_robot_is_where_its_joints_put_it(bottle):
 def test_paths_go_through_every_time_step_and_around_corners(bottle):
     drawing, shown = bottle
     path = upper_body().state(drawing.trajectory.joints).position("r_hand")
-    drawn = drawing.lines["/reproduction/r_hand"].points
+    drawn = drawing.lines["/reproduction/r_hand"]
     np.testing.assert_array_equal(drawn[1:, 0], drawn[:-1, 1])
     np.testing.assert_allclose(drawn[[0, -1], [0, 1]], path[[0, -1]], atol=1e-9)
     gaps = torch.cdist(path, torch.tensor(drawn[:, 0])).min(dim=1).values
     assert float(gaps.max()) < 0.1 * float(path.diff(dim=0).norm(dim=-1).max())
     turns, chords = np.diff(drawn[:, 1] - drawn[:, 0], axis=0), np.diff(path, n=2, axis=0)
     assert np.linalg.norm(turns, axis=1).max() < 0.1 * np.linalg.norm(chords, axis=1).max()
-    recorded = drawing.lines["/demonstrations/l_hand"].points
+    recorded = drawing.lines["/demonstrations/l_hand"]
     expected = [upper_body().state(one.joints).position("l_hand") for one in shown]
     np.testing.assert_allclose(recorded[0, 0], expected[0][0], atol=1e-9)
     np.testing.assert_allclose(recorded[-1, 1], expected[-1][-1], atol=1e-9)

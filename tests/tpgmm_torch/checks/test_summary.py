@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.refusals import refused
 from tests.support.skills import generator
 from tests.support.worlds import upper_body
 from tpgmm_torch import Demonstration, Frame, quaternions
@@ -226,5 +227,8 @@ def test_json_gives_it_back_and_damage_is_refused():
         again.start_frames(starts, robot)
     assert accepted < 600
     for spoiled in (config | {"more": 1}, {}, {k: config[k] for k in list(config)[1:]}, None):
-        with pytest.raises(DataError, match="summary"):
-            TrainingSummary.from_config(spoiled, robot)
+        refused(
+            lambda spoiled=spoiled: TrainingSummary.from_config(spoiled, robot),
+            DataError,
+            "summary",
+        )

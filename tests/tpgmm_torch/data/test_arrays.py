@@ -59,20 +59,17 @@ def test_nan_and_infinity_are_refused_with_their_index(values, index, bad):
     assert f"the first is {bad} at index {where}" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        [[1.0], [1.0, 2.0]],
-        ["one"],
-        ["1.0"],
-        [1j],
-        torch.ones(2, dtype=torch.complex64),
-        np.array(["2026-01-01"], dtype="datetime64[s]"),
-        [10**400],
-        [torch.ones((), requires_grad=True), torch.ones(())],
-        {"a": 1.0},
-    ],
-)
+@pytest.mark.parametrize("values", [
+    [[1.0], [1.0, 2.0]],
+    ["one"],
+    ["1.0"],
+    [1j],
+    torch.ones(2, dtype=torch.complex64),
+    np.array(["2026-01-01"], dtype="datetime64[s]"),
+    [10**400],
+    [torch.ones((), requires_grad=True), torch.ones(())],
+    {"a": 1.0},
+])  # fmt: skip
 def test_what_is_no_array_of_numbers_is_refused(values):
     with pytest.raises(DataError, match="joints must be an array of numbers"):
         as_tensor(values, "joints")

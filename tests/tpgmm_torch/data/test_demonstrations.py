@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.refusals import refused
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -50,30 +51,26 @@ def test_frames_are_found_by_name():
     assert str(pickle.loads(pickle.dumps(error.value))) == expected
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"time": []}, ShapeError, r"\(T,\) with T >= 1, got \(0,\)"),
-        ({"time": 1.0}, ShapeError, r"\(T,\) with T >= 1, got \(\)"),
-        ({"time": [[0.0, 1.0]]}, ShapeError, r"got \(1, 2\)"),
-        ({"time": [0.0, 1.0, 1.0, 2.0, 3.0]}, DataError, "from 1 to 1 s at index 2"),
-        ({"time": [0, 1, 2, 3, 2.5]}, DataError, "from 3 to 2.5 s at index 4"),
-        ({"time": [0, 1, 2, 3, math.nan]}, DataError, "time holds 1 value"),
-        ({"joints": np.zeros((4, 2))}, ShapeError, r"T = 5 as in time, got \(4, 2\)"),
-        ({"joints": np.zeros(5)}, ShapeError, r"T = 5 as in time, got \(5,\)"),
-        ({"joints": np.full((5, 2), math.inf)}, DataError, "joints holds 10 value"),
-        ({"joint_names": ("a",)}, ShapeError, r"needs 2 different names, got \('a',\)"),
-        ({"joint_names": ("a", "a")}, ShapeError, "needs 2 different names"),
-        ({"frames": {"cup": moving_frame(4)}}, ShapeError, r"'cup' .* \(4,\); .* \(5,\)"),
-        ({"frames": {"cup": [0.0, 0.0, 0.0]}}, DataError, "Frame objects, got 'cup': list"),
-        ({"frames": {1: Frame([0.0, 0.0, 0.0])}}, DataError, "Frame objects, got 1: Frame"),
-        ({"events": {"grasp": 2.5}}, DataError, "at 2.5 s lies outside .*, 0 to 2 s"),
-        ({"events": {"grasp": math.nan}}, DataError, "'grasp' at nan s lies outside"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "error", "message"), [
+    ({"time": []}, ShapeError, r"\(T,\) with T >= 1, got \(0,\)"),
+    ({"time": 1.0}, ShapeError, r"\(T,\) with T >= 1, got \(\)"),
+    ({"time": [[0.0, 1.0]]}, ShapeError, r"got \(1, 2\)"),
+    ({"time": [0.0, 1.0, 1.0, 2.0, 3.0]}, DataError, "from 1 to 1 s at index 2"),
+    ({"time": [0, 1, 2, 3, 2.5]}, DataError, "from 3 to 2.5 s at index 4"),
+    ({"time": [0, 1, 2, 3, math.nan]}, DataError, "time holds 1 value"),
+    ({"joints": np.zeros((4, 2))}, ShapeError, r"T = 5 as in time, got \(4, 2\)"),
+    ({"joints": np.zeros(5)}, ShapeError, r"T = 5 as in time, got \(5,\)"),
+    ({"joints": np.full((5, 2), math.inf)}, DataError, "joints holds 10 value"),
+    ({"joint_names": ("a",)}, ShapeError, r"needs 2 different names, got \('a',\)"),
+    ({"joint_names": ("a", "a")}, ShapeError, "needs 2 different names"),
+    ({"frames": {"cup": moving_frame(4)}}, ShapeError, r"'cup' .* \(4,\); .* \(5,\)"),
+    ({"frames": {"cup": [0.0, 0.0, 0.0]}}, DataError, "Frame objects, got 'cup': list"),
+    ({"frames": {1: Frame([0.0, 0.0, 0.0])}}, DataError, "Frame objects, got 1: Frame"),
+    ({"events": {"grasp": 2.5}}, DataError, "at 2.5 s lies outside .*, 0 to 2 s"),
+    ({"events": {"grasp": math.nan}}, DataError, "'grasp' at nan s lies outside"),
+])  # fmt: skip
 def test_demonstrations_refuse_bad_input(changes, error, message):
-    with pytest.raises(error, match=message):
-        demonstration(**changes)
+    refused(lambda: demonstration(**changes), error, message)
 
 
 def test_nothing_given_to_a_demonstration_is_shared_or_modified():
@@ -175,27 +172,23 @@ def test_without_time_frames_per_step_have_one_length():
 OF_THREE = {"frames": {"cup": moving_frame(3)}}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"joints": [[0.0]]}, ShapeError, r"a number for each joint, got shape \(1, 1\)"),
-        ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
-        ({"joints": {"a": math.nan}}, DataError, "joint 'a' holds 1 value"),
-        ({"joints": {"a": [1.0, 2.0]}}, ShapeError, "2 different names"),
-        ({"joints": {"a": "b"}}, DataError, "joint 'a' must be an array of numbers"),
-        ({"joints": {}}, ShapeError, "a number for each joint"),
-        ({"joints": {"a": 1.0}, "joint_names": ("a",)}, DataError, "leave out joint_names"),
-        ({"joints": [1.0], "joint_names": ("a", "b")}, ShapeError, "1 different names"),
-        ({"frames_time": [1.0, 1.0]}, DataError, "time must increase strictly"),
-        ({"frames_time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
-        ({"frames": {"cup": [0.0] * 3}}, DataError, "maps names to Frame objects, got 'cup'"),
-        ({"time": [1.0, 0.0]}, DataError, "time must increase strictly"),
-        ({"time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "error", "message"), [
+    ({"joints": [[0.0]]}, ShapeError, r"a number for each joint, got shape \(1, 1\)"),
+    ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
+    ({"joints": {"a": math.nan}}, DataError, "joint 'a' holds 1 value"),
+    ({"joints": {"a": [1.0, 2.0]}}, ShapeError, "2 different names"),
+    ({"joints": {"a": "b"}}, DataError, "joint 'a' must be an array of numbers"),
+    ({"joints": {}}, ShapeError, "a number for each joint"),
+    ({"joints": {"a": 1.0}, "joint_names": ("a",)}, DataError, "leave out joint_names"),
+    ({"joints": [1.0], "joint_names": ("a", "b")}, ShapeError, "1 different names"),
+    ({"frames_time": [1.0, 1.0]}, DataError, "time must increase strictly"),
+    ({"frames_time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
+    ({"frames": {"cup": [0.0] * 3}}, DataError, "maps names to Frame objects, got 'cup'"),
+    ({"time": [1.0, 0.0]}, DataError, "time must increase strictly"),
+    ({"time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
+])  # fmt: skip
 def test_situations_refuse_bad_input(arguments, error, message):
-    with pytest.raises(error, match=message):
-        Situation(**({"joints": [0.0]} | arguments))
+    refused(lambda: Situation(**({"joints": [0.0]} | arguments)), error, message)
 
 
 def test_check_demonstrations_takes_any_sequence():
@@ -207,19 +200,14 @@ def test_check_demonstrations_takes_any_sequence():
 WIDER = demonstration(joints=np.zeros((5, 3)), joint_names=None)
 
 
-@pytest.mark.parametrize(
-    ("given", "error", "message"),
-    [
-        (demonstration(), DataError, r"got one: wrap it, \[demonstration\]"),
-        (5, DataError, "expected a list of Demonstration, got int"),
-        ([], DataError, "at least one demonstration, got an empty list"),
-        ([demonstration(), None], DataError, "item 1 is NoneType"),
-        (np.zeros((2, 3)), DataError, "item 0 is ndarray"),
-        ([demonstration(), WIDER], ShapeError, "demonstration 1 has 3 joints, the first has 2"),
-        ([demonstration(), demonstration(frames={})], DataError, r"1 has frames \[\]"),
-    ],
-    ids=["one", "number", "empty", "other type", "array", "joints", "frames"],
-)
+@pytest.mark.parametrize(("given", "error", "message"), [
+    (demonstration(), DataError, r"got one: wrap it, \[demonstration\]"),
+    (5, DataError, "expected a list of Demonstration, got int"),
+    ([], DataError, "at least one demonstration, got an empty list"),
+    ([demonstration(), None], DataError, "item 1 is NoneType"),
+    (np.zeros((2, 3)), DataError, "item 0 is ndarray"),
+    ([demonstration(), WIDER], ShapeError, "demonstration 1 has 3 joints, the first has 2"),
+    ([demonstration(), demonstration(frames={})], DataError, r"1 has frames \[\]"),
+], ids=["one", "number", "empty", "other type", "array", "joints", "frames"])  # fmt: skip
 def test_check_demonstrations_says_what_is_wrong(given, error, message):
-    with pytest.raises(error, match=message):
-        check_demonstrations(given)
+    refused(lambda: check_demonstrations(given), error, message)

@@ -6,6 +6,7 @@ import pickle
 
 import pytest
 
+from tests.support.refusals import refused
 from tpgmm_torch import Hold
 from tpgmm_torch.data.holds import check_holds
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -40,8 +41,7 @@ def test_texts_are_read_as_they_are_written():
     "text", ["", "bottle", "bottle@", "@hand", "a@b@c", "bottle@hand:soon-", "bottle@hand:4.3"]
 )
 def test_what_is_no_hold_is_refused_and_explained(text):
-    with pytest.raises(DataError, match=r"FRAME@LINK:BEGIN-END.*'bottle@l_hand:4\.3-'"):
-        Hold.parse(text)
+    refused(lambda: Hold.parse(text), DataError, r"FRAME@LINK:BEGIN-END.*'bottle@l_hand:4\.3-'")
 
 
 @pytest.mark.parametrize("times", [(4.0, 3.0), (4.0, 4.0), (math.inf, math.inf)])
@@ -50,19 +50,15 @@ def test_the_end_is_after_the_beginning(times):
         Hold("bottle", "l_hand", *times)
 
 
-@pytest.mark.parametrize(
-    ("hold", "message"),
-    [
-        (("", "l_hand"), "the frame of a hold is a name, got ''"),
-        (("bottle", None), "the link of a hold is a name, got None"),
-        (("bottle", "bottle"), "'bottle' cannot hold itself"),
-        (("bottle", "l_hand", math.nan), "the begin of bottle@l_hand is a number"),
-        (("bottle", "l_hand", 1.0, "late"), "the end of bottle@l_hand is a number"),
-    ],
-)
+@pytest.mark.parametrize(("hold", "message"), [
+    (("", "l_hand"), "the frame of a hold is a name, got ''"),
+    (("bottle", None), "the link of a hold is a name, got None"),
+    (("bottle", "bottle"), "'bottle' cannot hold itself"),
+    (("bottle", "l_hand", math.nan), "the begin of bottle@l_hand is a number"),
+    (("bottle", "l_hand", 1.0, "late"), "the end of bottle@l_hand is a number"),
+])  # fmt: skip
 def test_names_are_names_and_times_are_times(hold, message):
-    with pytest.raises(DataError, match=message):
-        Hold(*hold)
+    refused(lambda: Hold(*hold), DataError, message)
 
 
 def test_holds_are_put_in_the_order_of_time():
@@ -80,8 +76,7 @@ def test_holds_are_put_in_the_order_of_time():
     ],
 )
 def test_an_unknown_frame_or_link_is_named_with_those_that_exist(hold, message):
-    with pytest.raises(UnknownNameError, match=message):
-        check_holds([hold], FRAMES, LINKS)
+    refused(lambda: check_holds([hold], FRAMES, LINKS), UnknownNameError, message)
 
 
 def test_one_link_is_the_holder():

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.support.hub_server import local_hub
+from tests.support.refusals import refused
 from tests.support.skills import small_bottle
 from tpgmm_torch import TaskParameterizedGMM, save
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
@@ -45,8 +46,7 @@ def test_what_was_changed_on_the_hub_is_refused(hub):
     push(small_bottle(), "lab/shake")
     files = hub.repositories["lab/shake"]
     files["config.json"] = files["config.json"].replace(b'"l_hand"', b'"r_hand"')
-    with pytest.raises(ModelFileError, match="changed after it was saved"):
-        load("lab/shake")
+    refused(lambda: load("lab/shake"), ModelFileError, "changed after it was saved")
 
 
 def test_a_folder_is_taken_as_it_is(tmp_path, hub):
@@ -59,25 +59,20 @@ def test_a_folder_is_taken_as_it_is(tmp_path, hub):
 @pytest.mark.parametrize("missing", ["./model", "/lab/shake", "model", "a/b/c", "../model"])
 def test_a_folder_that_is_missing_is_not_looked_up(missing, hub, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ModelFileError, match="there is no folder"):
-        load(missing)
+    refused(lambda: load(missing), ModelFileError, "there is no folder")
     assert not hub.paths
 
 
 def test_a_repository_that_is_missing_is_an_error_of_this_project(hub):
-    with pytest.raises(ModelFileError, match="lab/none"):
-        load("lab/none")
+    refused(lambda: load("lab/none"), ModelFileError, "lab/none")
 
 
 def test_an_id_needs_an_owner_and_a_fitted_model(hub):
-    with pytest.raises(DataError, match="owner/name"):
-        push(small_bottle(), "shake")
-    with pytest.raises(Exception, match="not fitted"):
-        push(TaskParameterizedGMM(3), "lab/shake")
+    refused(lambda: push(small_bottle(), "shake"), DataError, "owner/name")
+    refused(lambda: push(TaskParameterizedGMM(3), "lab/shake"), Exception, "not fitted")
     assert not hub.paths
 
 
 def test_without_the_package_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[hub\]"):
-        load("lab/shake")
+    refused(lambda: load("lab/shake"), DependencyError, r"tpgmm-torch\[hub\]")

@@ -214,21 +214,18 @@ def test_a_component_without_data_keeps_its_place_and_shape():
         torch.testing.assert_close(own[3], before[3])
 
 
-@pytest.mark.parametrize(
-    ("mass", "variance", "total", "dead"),
-    [
-        (500.0, 1.0, 1000, False),
-        (500.0, 1e-4, 1000, False),  # narrow, but with data
-        (2.0, 1e-4, 1000, True),  # the variance is the regularisation
-        (2.0, 1.9e-4, 1000, True),
-        (2.0, 2.1e-4, 1000, False),
-        (2.1, 1e-4, 1000, False),
-        (2.0, 1e-4, 6, False),  # there is not data enough for more
-        (2.0, 1e-4, 7, True),
-        (2e-12, 1.0, 1000, True),
-        (3e-12, 1.0, 1000, False),
-    ],
-)
+@pytest.mark.parametrize(("mass", "variance", "total", "dead"), [
+    (500.0, 1.0, 1000, False),
+    (500.0, 1e-4, 1000, False),  # narrow, but with data
+    (2.0, 1e-4, 1000, True),  # the variance is the regularisation
+    (2.0, 1.9e-4, 1000, True),
+    (2.0, 2.1e-4, 1000, False),
+    (2.1, 1e-4, 1000, False),
+    (2.0, 1e-4, 6, False),  # there is not data enough for more
+    (2.0, 1e-4, 7, True),
+    (2e-12, 1.0, 1000, True),
+    (3e-12, 1.0, 1000, False),
+])  # fmt: skip
 def test_components_without_mass_or_spread_are_dead(mass, variance, total, dead):
     points, lambdas = points_of(movements()), family(1e-4)
     found = e_step(binned(points, lambdas, 3), points)
@@ -282,15 +279,12 @@ def learn(start, points, lambdas, **settings):
     return expectation_maximization(start, points, lambdas, rng, **{"tol": 0.0, **settings})
 
 
-@pytest.mark.parametrize(
-    ("measured", "counted"),
-    [
-        ([-1.0, -5.0], [-5.0]),  # the start, and what reseeding has lowered it to
-        ([-1.0, -0.5], [-1.0]),
-        ([-1.0, -5.0, -4.0, -3.0], [-5.0, -4.0]),
-        ([-1.0, -0.5, -0.4, -0.3], [-1.0, -0.5, -0.4]),
-    ],
-)
+@pytest.mark.parametrize(("measured", "counted"), [
+    ([-1.0, -5.0], [-5.0]),  # the start, and what reseeding has lowered it to
+    ([-1.0, -0.5], [-1.0]),
+    ([-1.0, -5.0, -4.0, -3.0], [-5.0, -4.0]),
+    ([-1.0, -0.5, -0.4, -0.3], [-1.0, -0.5, -0.4]),
+])  # fmt: skip
 def test_bounds_are_counted_from_where_reseeding_lowered_them(measured, counted, monkeypatch):
     points, lambdas = points_of(movements(2000)), family()
     start = with_a_component_far_away(binned(points, lambdas, K))

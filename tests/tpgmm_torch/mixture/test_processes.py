@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests.support import torchrun_worker as worker
+from tests.support.refusals import refused
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.processes import Processes, joined_processes
 
@@ -102,5 +103,4 @@ def test_shares_are_consecutive_and_nearly_equal():
     for processes.rank in range(3):
         shares.append(processes.share("abcdefgh"))
     assert shares == [["a", "b"], ["c", "d", "e"], ["f", "g", "h"]]
-    with pytest.raises(DataError, match=r"2 episodes or batches.*3 processes"):
-        processes.share("ab")
+    refused(lambda: processes.share("ab"), DataError, r"2 episodes or batches.*3 processes")

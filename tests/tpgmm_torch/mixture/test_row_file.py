@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from tests.support.blocks import WIDTHS, fitted
+from tests.support.refusals import refused
+from tests.support.skills import same
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile
@@ -27,10 +29,7 @@ def timed_rows():
 
 
 def assert_same(model, other, tolerance=1e-9):
-    close = {"rtol": tolerance, "atol": tolerance}
-    torch.testing.assert_close(model.weights_, other.weights_, **close)
-    torch.testing.assert_close(model.means_, other.means_, **close)
-    torch.testing.assert_close(model.covariances_, other.covariances_, **close)
+    same(model, other, tolerance)
     assert model.lower_bounds_ == pytest.approx(other.lower_bounds_, rel=tolerance)
     assert model.n_iter_ == other.n_iter_
 
@@ -79,21 +78,17 @@ def with_nan(piece):
     return piece
 
 
-@pytest.mark.parametrize(
-    ("spoil", "error", "message"),
-    [
-        (with_nan, DataError, "batch 2: .*NaN"),
-        (lambda piece: piece[:, :4], ShapeError, "batch 2 has 4 columns.* before have 5"),
-        (lambda piece: piece[:, 0], DataError, "batch 2: .*2D"),
-        (lambda piece: np.char.add(piece.astype(str), "x"), DataError, "batch 2: .*string"),
-        (lambda piece: None, DataError, "batch 2: "),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "error", "message"), [
+    (with_nan, DataError, "batch 2: .*NaN"),
+    (lambda piece: piece[:, :4], ShapeError, "batch 2 has 4 columns.* before have 5"),
+    (lambda piece: piece[:, 0], DataError, "batch 2: .*2D"),
+    (lambda piece: np.char.add(piece.astype(str), "x"), DataError, "batch 2: .*string"),
+    (lambda piece: None, DataError, "batch 2: "),
+])  # fmt: skip
 def test_a_bad_batch_is_named(timed_rows, spoil, error, message):
     pieces = np.split(timed_rows, [500, 1000, 2000])
     pieces[2] = spoil(pieces[2])
-    with pytest.raises(error, match=message):
-        RowFile.of(iter(pieces))
+    refused(lambda: RowFile.of(iter(pieces)), error, message)
 
 
 def test_no_rows_and_one_row_are_refused():
@@ -153,5 +148,4 @@ def test_rounding_is_ten_times_the_precision_of_the_largest(times, varies):
     [(np.empty((0, 3)), "there are no rows"), (np.array([[1e200], [-1e200]]), "overflows")],
 )
 def test_rows_without_moments_are_refused(rows, message):
-    with pytest.raises(DataError, match=message):
-        ColumnMoments.of(rows)
+    refused(lambda: ColumnMoments.of(rows), DataError, message)

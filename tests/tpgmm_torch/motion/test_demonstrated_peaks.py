@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from tpgmm_torch import Demonstration
-from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
+from tpgmm_torch.motion.demonstrated_peaks import joint_peaks, typical_peaks
 
 NAMES = ("a", "b")
+
+
+def demonstrated_peaks(demonstrations, names):
+    return typical_peaks([joint_peaks(one.reorder(names)) for one in demonstrations])
 
 
 def swing(amplitude=0.5, rate=100.0, noise=0.0, seed=0, order=NAMES, uneven=False):

@@ -27,6 +27,7 @@ from tests.support.own_operators import (
     Q,
     planar_jacobian,
 )
+from tests.support.refusals import refused
 from tests.support.worlds import CARRIED, GRASP, LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
 from tpgmm_torch import (
     AbsoluteOrientation,
@@ -59,43 +60,28 @@ def test_a_link_is_seen_from_another_like_from_an_object_but_moves_with_it(kind,
     assert not torch.allclose(link.linear(state, {}), thing.linear(state, there), atol=1e-2)
 
 
-LINKED = [
-    AbsolutePosition("elbow"),
-    AbsoluteOrientation("elbow"),
-    RelativePosition("elbow", OBJECT),
-    RelativeOrientation("elbow", OBJECT),
-    Stack(AbsolutePosition(LEFT), AbsolutePosition("elbow")),
-]
+LINK = r"'elbow' is not in the .*; it has \['l_hand', 'object', 'r_hand'\]"
+FRAME = r"frame 'cup' is not in .*\['l_hand', 'obj"
+UNKNOWN = [
+    (AbsolutePosition("elbow"), LINK, LINK),
+    (AbsoluteOrientation("elbow"), LINK, LINK),
+    (RelativePosition("elbow", OBJECT), LINK, LINK),
+    (RelativeOrientation("elbow", OBJECT), LINK, LINK),
+    (Stack(AbsolutePosition(LEFT), AbsolutePosition("elbow")), LINK, LINK),
+    (RelativePosition(LEFT, "cup"), r"frame 'cup' is not in .*\['object'", FRAME),
+    (RelativeOrientation(LEFT, "cup"), r"frame 'cup' is not in .*\['object'", FRAME),
+    (Stack(RelativePosition(LEFT, OBJECT), RelativePosition(LEFT, "cup")),
+     r"frame 'cup' is not in .*\['object'", FRAME),
+]  # fmt: skip
 
 
 @WORLDS
-@pytest.mark.parametrize("operator", LINKED, ids=repr)
-def test_an_unknown_link_is_named_with_those_that_exist(operator, world: World):
+@pytest.mark.parametrize(("operator", "at_once", "later"), UNKNOWN)
+def test_an_unknown_name_comes_with_those_that_exist(operator, at_once, later, world: World):
     state, frames = world.scene()
-    listed = r"'elbow' is not in the .*; it has \['l_hand', 'object', 'r_hand'\]"
-    with pytest.raises(UnknownNameError, match=listed):
-        operator.check(world.kinematics, frames)
-    for call in (operator.linearize, operator.coordinates):
-        with pytest.raises(UnknownNameError, match=listed):
-            call(state, frames)
-
-
-FRAMED = [
-    RelativePosition(LEFT, "cup"),
-    RelativeOrientation(LEFT, "cup"),
-    Stack(RelativePosition(LEFT, OBJECT), RelativePosition(LEFT, "cup")),
-]
-
-
-@WORLDS
-@pytest.mark.parametrize("operator", FRAMED, ids=repr)
-def test_an_unknown_frame_is_named_with_those_that_exist(operator, world: World):
-    state, frames = world.scene()
-    with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['object'"):
-        operator.check(world.kinematics, frames)
-    for call in (operator.linearize, operator.coordinates):
-        with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['l_hand', 'obj"):
-            call(state, frames)
+    refused(lambda: operator.check(world.kinematics, frames), UnknownNameError, at_once)
+    refused(lambda: operator.linearize(state, frames), UnknownNameError, later)
+    refused(lambda: operator.coordinates(state, frames), UnknownNameError, later)
 
 
 @WORLDS
@@ -340,13 +326,10 @@ def test_gradients_pass_through_operators_of_ones_own(operator, fusion):
 @pytest.mark.parametrize("kind", [RelativePosition, RelativeOrientation])
 def test_what_is_no_name_is_given_by_name(kind):
     """The third value was ``held`` of one and the gain of the other."""
-    with pytest.raises(TypeError, match="positional"):
-        kind(LEFT, OBJECT, True)
+    refused(lambda: kind(LEFT, OBJECT, True), TypeError, "positional")
     assert kind(LEFT, OBJECT, held=True).links() == (LEFT, OBJECT)
-    with pytest.raises(DataError, match="held is True or False, got 'no'"):
-        kind(LEFT, OBJECT, held="no")
-    with pytest.raises(DataError, match=f"'{LEFT}' seen from itself"):
-        kind(LEFT, LEFT)
+    refused(lambda: kind(LEFT, OBJECT, held="no"), DataError, "held is True or False, got 'no'")
+    refused(lambda: kind(LEFT, LEFT), DataError, f"'{LEFT}' seen from itself")
 
 
 @pytest.mark.parametrize("gain", [math.nan, math.inf, 0.0, -2.0, True, "2"])
@@ -354,8 +337,7 @@ def test_what_is_no_name_is_given_by_name(kind):
     "kind", [AbsoluteOrientation, partial(RelativeOrientation, frame=OBJECT)]
 )
 def test_a_gain_is_a_positive_number(gain, kind):
-    with pytest.raises(DataError, match="gain is a positive number, got"):
-        kind(LEFT, gain=gain)
+    refused(lambda: kind(LEFT, gain=gain), DataError, "gain is a positive number, got")
 
 
 def test_nothing_counts_twice():

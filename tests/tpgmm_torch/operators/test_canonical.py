@@ -34,9 +34,6 @@ from tpgmm_torch.robots.kinematics import JointSpace
 class CanonicalLaws(OperatorLaws):
     operator = Canonical()
 
-    def row(self, at):
-        return oracles.canonical(at)
-
 
 class TestCanonicalOnRobot(OnRobot, CanonicalLaws):
     pass

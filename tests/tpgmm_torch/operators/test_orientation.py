@@ -11,8 +11,7 @@ from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot
 from tpgmm_torch import AbsoluteOrientation, RelativeOrientation
 
 KINDS = AbsoluteOrientation, RelativeOrientation
-ROWS = oracles.absolute_orientation, oracles.relative_orientation
-globals().update(laws_in_places(KINDS, ROWS, OrientationLaws))
+globals().update(laws_in_places(KINDS, OrientationLaws))
 
 
 class AsPrinted(OrientationLaws):
@@ -34,8 +33,9 @@ PRINTED = {
     "PrintedRelative": ([OnRobot], LEFT, OBJECT),
     "PrintedHandToHand": ([OnRobot], LEFT, RIGHT),
 }
+ROWS = oracles.absolute_orientation, oracles.relative_orientation
 HALF = [partial(row, gain=1.0) for row in ROWS]
-globals().update(laws_in_places(KINDS, HALF, AsPrinted, PRINTED, gain=1.0))
+globals().update(laws_in_places(KINDS, AsPrinted, PRINTED, HALF, gain=1.0))
 
 
 def test_the_gain_is_without_effect_where_nothing_is_linearised():

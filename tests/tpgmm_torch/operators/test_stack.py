@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from tests.support import oracles
+from tests.support.mixtures import BOTH_HANDS
 from tests.support.operator_battery import OrientationLaws, RelativeLaws
+from tests.support.refusals import refused
 from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, upper_body
 from tpgmm_torch import (
     AbsoluteOrientation,
@@ -23,20 +25,7 @@ from tpgmm_torch.robots.kinematics import JointSpace
 class BothHandsLaws(RelativeLaws, OrientationLaws):
     """The paper's first operator, eqs (16), (17)."""
 
-    operator = Stack(
-        RelativePosition(LEFT, OBJECT),
-        RelativeOrientation(LEFT, OBJECT),
-        RelativePosition(RIGHT, OBJECT),
-        RelativeOrientation(RIGHT, OBJECT),
-    )
-
-    def row(self, at):
-        return oracles.stack(
-            oracles.relative_position(at, LEFT, OBJECT),
-            oracles.relative_orientation(at, LEFT, OBJECT),
-            oracles.relative_position(at, RIGHT, OBJECT),
-            oracles.relative_orientation(at, RIGHT, OBJECT),
-        )
+    operator = BOTH_HANDS
 
 
 class TestBothHandsOnRobot(OnRobot, BothHandsLaws):
@@ -63,15 +52,6 @@ class MixedStackLaws(OrientationLaws):
         RelativePosition(RIGHT, LEFT),
     )
 
-    def row(self, at):
-        return oracles.stack(
-            oracles.canonical(at),
-            oracles.absolute_orientation(at, LEFT),
-            oracles.absolute_position(at, RIGHT),
-            oracles.relative_orientation(at, LEFT, RIGHT),
-            oracles.relative_position(at, RIGHT, LEFT),
-        )
-
 
 class TestMixedStackOnRobot(OnRobot, MixedStackLaws):
     pass
@@ -82,12 +62,9 @@ class TestMixedStackOnPoses(OnPoses, MixedStackLaws):
 
 
 def test_a_stack_needs_operators():
-    with pytest.raises(DataError, match="at least one operator"):
-        Stack()
-    with pytest.raises(DataError, match="takes operators, got str"):
-        Stack(Canonical(), LEFT)
-    with pytest.raises(DataError, match="takes operators, got list"):
-        Stack([Canonical()])
+    refused(lambda: Stack(), DataError, "at least one operator")
+    refused(lambda: Stack(Canonical(), LEFT), DataError, "takes operators, got str")
+    refused(lambda: Stack([Canonical()]), DataError, "takes operators, got list")
 
 
 def test_the_canonical_operator_alone_determines_every_joint():

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from tests.support import oracles
 from tests.support.mixtures import assert_close, conditionals_of, random_local
+from tests.support.refusals import refused
 from tpgmm_torch import gaussians
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.conditionals import ActiveComponents, Conditionals, TimeMarginals
@@ -75,8 +76,7 @@ def test_a_product_of_conditionals_is_the_product_of_gaussians_at_any_time(count
 def test_a_singular_factor_is_refused():
     first, second = conditionals_of(local(0, 2)), conditionals_of(local(1, 2))
     second.covariance.zero_()
-    with pytest.raises(DataError, match="a factor of the product"):
-        Conditionals.product([first, second])
+    refused(lambda: Conditionals.product([first, second]), DataError, "a factor of the product")
 
 
 # Windows of time

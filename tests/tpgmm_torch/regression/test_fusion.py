@@ -26,6 +26,16 @@ def assert_same(first, second, atol=1e-9):
         )
 
 
+def alone(regression, problem, whole, index, now, atol=1e-8):
+    """Estimate one robot of a batch, which has to be as it is among the others."""
+    frames = {name: frame[index] for name, frame in problem.frames.items()}
+    one = regression.estimate(now, problem.state[index], frames)
+    for name in ("joints", "covariance"):
+        found = getattr(whole, name)[index]
+        torch.testing.assert_close(found, getattr(one, name), rtol=0, atol=atol)
+    return one
+
+
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
 @pytest.mark.parametrize("name", ["the paper's", "canonical", "positions", "three"])
 def test_the_update_is_the_sum_of_precisions(name, batch):
@@ -69,10 +79,7 @@ def test_thousands_of_robots_are_parts_of_a_few(alike):
     now = times() if alike else times(count)
     whole = regression.estimate(now, problem.state.joints, problem.frames)
     for index in (0, PART - 1, PART, count - 1):
-        frames = {name: frame[index] for name, frame in problem.frames.items()}
-        one = regression.estimate(now if alike else now[index], problem.state[index], frames)
-        torch.testing.assert_close(whole.joints[index], one.joints, rtol=0, atol=1e-8)
-        torch.testing.assert_close(whole.covariance[index], one.covariance, rtol=0, atol=1e-8)
+        alone(regression, problem, whole, index, now if alike else now[index])
 
 
 def test_frames_that_no_operator_asks_for_make_no_batch():
@@ -81,26 +88,6 @@ def test_frames_that_no_operator_asks_for_make_no_batch():
     other = Frame(torch.zeros(PART + 1, 3, dtype=torch.float64))
     alone = regression.estimate(*at, problem.frames)
     assert_same(regression.estimate(*at, {**problem.frames, "other": other}), alone)
-
-
-def test_float32_is_float64_to_its_own_precision():
-    problem = Problem.of(CASES["the paper's"], 4, 3)
-    double = problem.regression()
-    robot = problem.case.world.kinematics.to(torch.float32)
-    old, weights = double.conditionals, double.log_weights.float()
-    new = [type(m)(*(getattr(m, f).float() for f in m.__annotations__)) for m in old]
-    single = replace(double, kinematics=robot, conditionals=new, log_weights=weights)
-    shown = problem.frames.items()
-    frames = {name: Frame(f.position.float(), f.orientation.float()) for name, f in shown}
-    state = robot.state(problem.state.joints.float())
-    expected = double.estimate(times(3), problem.state, problem.frames)
-    actual = single.estimate(times(3).float(), state, frames)
-    assert actual.joints.dtype == torch.float32
-    torch.testing.assert_close(actual.joints.double(), expected.joints, rtol=0, atol=2e-4)
-    torch.testing.assert_close(
-        actual.covariance.double(), expected.covariance, rtol=1e-3, atol=1e-5
-    )
-    torch.linalg.cholesky(actual.covariance)
 
 
 SILENT = {
@@ -170,11 +157,9 @@ def test_robots_at_their_own_times_are_each_as_if_it_were_alone(negligible):
     together = regression.estimate(times(count), problem.state.joints, problem.frames)
     left_out = 0
     for index in range(count):
-        frames = {name: frame[index] for name, frame in problem.frames.items()}
-        alone = regression.estimate(times(count)[index], problem.state[index], frames)
-        torch.testing.assert_close(together.joints[index], alone.joints, rtol=0, atol=1e-12)
-        assert torch.equal(together.activation[index] == 0, alone.activation == 0)
-        left_out += int((alone.activation == 0).sum())
+        one = alone(regression, problem, together, index, times(count)[index], 1e-12)
+        assert torch.equal(together.activation[index] == 0, one.activation == 0)
+        left_out += int((one.activation == 0).sum())
     assert left_out > 0
 
 
@@ -186,10 +171,4 @@ def test_a_grid_of_many_robots_may_have_times_along_one_side():
         whole = regression.estimate(now, problem.state.joints, problem.frames)
         assert whole.joints.shape == problem.state.joints.shape
         for place in ((0, 0), (2, 1), (1, columns - 1)):
-            frames = {name: frame[place] for name, frame in problem.frames.items()}
-            time = now.expand(rows, columns)[place]
-            one = regression.estimate(time, problem.state.joints[place], frames)
-            torch.testing.assert_close(whole.joints[place], one.joints, rtol=0, atol=1e-8)
-            torch.testing.assert_close(
-                whole.covariance[place], one.covariance, rtol=0, atol=1e-8
-            )
+            alone(regression, problem, whole, place, now.expand(rows, columns)[place])

@@ -7,12 +7,10 @@ import pytest
 import torch
 
 from tests.support.mixtures import CASES, Problem
-from tests.support.skills import HANDLING, handlings, hands_model, waves
-from tpgmm_control import rollout
-from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM, save
+from tests.support.skills import waves
+from tpgmm_torch import Canonical, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import information
-from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression import regression as module
 from tpgmm_torch.regression.fusion import Projection
 from tpgmm_torch.regression.fusion_forms import InformationFusion
@@ -113,19 +111,6 @@ def test_the_sum_of_precisions_and_the_kalman_update_agree():
     other = replace(strict, operators=summed)
     assert strict._update is not None and other._update is None
     torch.testing.assert_close(step(strict), step(other), rtol=1e-5, atol=1e-7)
-
-
-def test_they_are_saved_with_the_model(tmp_path):
-    form = InformationFusion(priorities=(1, 1, 0))
-    model = hands_model(operators=[*HANDLING, Canonical()], fusion=form).fit(handlings(4))
-    save(model, tmp_path / "model")
-    again = load_model(tmp_path / "model")
-    assert again.fusion == form
-    situation = Situation.of(handlings(5)[4])
-    [one], [other] = model.predict([situation]), again.predict([situation])
-    torch.testing.assert_close(one.joints, other.joints)
-    [soft] = rollout(replace(model.skill, fusion=InformationFusion()), [situation])
-    assert float((soft.joints - one.joints).abs().max()) > 1e-6
 
 
 @pytest.mark.parametrize(

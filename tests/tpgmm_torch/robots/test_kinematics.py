@@ -1,7 +1,9 @@
 """States of robots as tensors, and robots of a user's own."""
 
 import copy
+import json
 import math
+import pickle
 import re
 from typing import Any
 
@@ -15,8 +17,9 @@ from tests.support.own_operators import PlanarArm
 from tests.support.robot_zoo import assert_differences_agree, random_joints, upper_body, zoo
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
-from tpgmm_torch.robots import RobotState
+from tpgmm_torch.robots import Poses, RobotState
 from tpgmm_torch.robots.kinematics import JointSpace, parse_dtype
+from tpgmm_torch.robots.robot import Robot
 
 #: A grasp.
 CUP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
@@ -260,16 +263,62 @@ def test_nothing_is_limited():
     assert space.state([1.0, 2.0]).joints.dtype == torch.float32
 
 
-def test_its_names_are_all_of_it():
-    space = JointSpace(("a", "b"))
-    assert space.joint_names == ("a", "b")
-    assert JointSpace.from_config(space.config()) == space == copy.deepcopy(space)
-    assert hash(JointSpace.from_config(space.config())) == hash(space)
-    assert space != JointSpace(("b", "a"))
-    assert space != ("a", "b")
-    assert repr(space) == "JointSpace(2 joints)"
-
-
 def test_other_numbers_of_joints_are_refused():
     with pytest.raises(ShapeError, match=r"\['a', 'b'\], got \(3,\)"):
         JointSpace(("a", "b")).state(torch.zeros(3))
+
+
+def tooled() -> Robot:
+    """A robot of which everything was set."""
+    tools = {"cup": ("flange", [0.1, 0.2, 0.3], [0.6, 0.0, 0.8001, 0.0])}
+    joints = {
+        "joints": ["elbow", "hand", "wag"],
+        "locked": {"lift": 0.2},
+        "coordinates": ["hand"],
+    }
+    return zoo(("cup", "tip"), base="column", tools=tools, dtype=torch.float32, **joints)
+
+
+VALUES = {
+    "robot": tooled(),
+    "two robots": Robot.combine({"left": CUP}, left=zoo(("tip",)), right=upper_body()),
+    "poses": Poses(),
+    "positions": Poses(("a", "b"), orientation=False, dtype=torch.float32),
+    "joints": JointSpace(("a", "b")),
+}
+
+
+@pytest.mark.parametrize("robot", VALUES.values(), ids=list(VALUES))
+def test_a_robot_is_a_value(robot: Any) -> None:
+    saved = type(robot).from_config(json.loads(json.dumps(robot.config())))
+    assert saved.config() == robot.config() and saved.lower.dtype == robot.lower.dtype
+    joints = torch.rand(2, robot.n_joints)
+    for other in (
+        saved,
+        copy.copy(robot),
+        copy.deepcopy(robot),
+        pickle.loads(pickle.dumps(robot)),
+    ):
+        assert other == robot and hash(other) == hash(robot)
+        assert torch.equal(other.state(joints).jacobians, robot.state(joints).jacobians)
+        assert torch.equal(other.state(joints).positions, robot.state(joints).positions)
+    assert robot != JointSpace(("b", "a")) and robot != ("a", "b")
+
+
+def test_joints_without_a_robot_have_names() -> None:
+    space = JointSpace(("a", "b"))
+    assert space.joint_names == ("a", "b") and repr(space) == "JointSpace(2 joints)"
+
+
+@pytest.mark.parametrize(("robot", "change", "message"), [
+    ("robot", {"color": "red"}, "color"),
+    ("robot", {"dtype": "int8"}, "int8"),
+    ("robot", {"urdf": "robot.urdf"}, "not a path"),
+    ("robot", {"links": ["cup", "nose"]}, "nose"),
+    ("poses", {"color": "red"}, "color"),
+    ("poses", {"dtype": "int8"}, "int8"),
+])  # fmt: skip
+def test_a_tampered_config_is_refused(robot: str, change: dict[str, Any], message: str) -> None:
+    made = VALUES[robot]
+    with pytest.raises((DataError, UnknownNameError), match=message):
+        type(made).from_config(made.config() | change)

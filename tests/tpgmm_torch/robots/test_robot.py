@@ -1,9 +1,6 @@
 """Robots of a URDF against pinocchio, MuJoCo, finite differences and closed forms."""
 
-import copy
-import json
 import math
-import pickle
 import random
 import re
 import time
@@ -17,6 +14,7 @@ import pinocchio as pin
 import pytest
 import torch
 
+from tests.support.refusals import refused
 from tests.support.robot_zoo import (
     G1_PATH,
     ZOO,
@@ -172,8 +170,7 @@ class TestSettings:
 
     def test_more_joints_than_a_robot_has_are_refused(self, monkeypatch) -> None:
         monkeypatch.setattr(robot_module, "MOST_JOINTS", 10)
-        with pytest.raises(DataError, match=r"has 17 joints, 17 of them .*choose"):
-            upper_body()
+        refused(lambda: upper_body(), DataError, r"has 17 joints, 17 of them .*choose")
         assert upper_body(joints=["l_*"]).n_joints < 10
 
     def test_joints_that_are_not_named_stand_at_zero(self) -> None:
@@ -283,53 +280,6 @@ class TestSettings:
             Robot.from_urdf(text, ("flange",))
 
 
-class TestObject:
-    @pytest.fixture
-    def robot(self) -> Robot:
-        tools = {"cup": ("flange", [0.1, 0.2, 0.3], [0.6, 0.0, 0.8001, 0.0])}
-        return zoo(
-            ("cup", "tip"),
-            joints=["elbow", "hand", "wag"],
-            locked={"lift": 0.2},
-            coordinates=["hand"],
-            base="column",
-            tools=tools,
-            dtype=torch.float32,
-        )
-
-    def test_config_is_json_and_gives_the_same_robot(self, robot: Robot) -> None:
-        again = Robot.from_config(json.loads(json.dumps(robot.config())))
-        assert again == robot
-        assert again.config() == robot.config()
-        assert (
-            again.state(torch.ones(3)).jacobians == robot.state(torch.ones(3)).jacobians
-        ).all()
-
-    @pytest.mark.parametrize(
-        "copied", [copy.copy, copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))]
-    )
-    def test_copies_are_equal_and_work(self, robot: Robot, copied: Any) -> None:
-        other = copied(robot)
-        assert other == robot and hash(other) == hash(robot)
-        joints = torch.ones(2, 3)
-        assert (other.state(joints).positions == robot.state(joints).positions).all()
-
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"color": "red"}, "color"),
-            ({"dtype": "int8"}, "int8"),
-            ({"urdf": "robot.urdf"}, "not a path"),
-            ({"links": ["cup", "nose"]}, "nose"),
-        ],
-    )
-    def test_a_tampered_config_is_refused(
-        self, robot: Robot, change: dict[str, Any], message: str
-    ) -> None:
-        with pytest.raises((DataError, UnknownNameError), match=message):
-            Robot.from_config(robot.config() | change)
-
-
 def assert_moves_like(both: RobotState, arm: RobotState, pose: Frame, first: int) -> None:
     """The links of one robot of two, from ``first`` on, are those of the robot alone."""
     links = slice(first, first + len(arm.links))
@@ -392,20 +342,16 @@ class TestCombining:
         joints = random_joints(arm, 5)
         assert_moves_like(both.state(joints), arm.state(joints), self.right, 0)
 
-    def test_they_are_saved_and_combined_like_any_robot(self) -> None:
+    def test_they_are_combined_like_any_robot(self) -> None:
         both = Robot.combine({"left": self.left}, left=zoo(("tip",)), right=upper_body())
-        again = Robot.from_config(json.loads(json.dumps(both.config())))
-        assert again == both
         joints = random_joints(both, 3)
-        assert torch.equal(again.state(joints).jacobians, both.state(joints).jacobians)
         four = Robot.combine(near=both, far=both, poses={"far": self.right})
         assert four.joint_names[0] == "near_left_lift"
         assert_moves_like(four.state(joints.repeat(1, 2)), both.state(joints), self.right, 3)
 
     def test_what_does_not_go_together(self) -> None:
         arm = zoo(("tip",))
-        with pytest.raises(DataError, match="robots by name"):
-            Robot.combine()
+        refused(lambda: Robot.combine(), DataError, "robots by name")
         with pytest.raises(DataError, match="robots by name"):
             Robot.combine(left=Poses(["hand"]))  # type: ignore[arg-type]
         with pytest.raises(UnknownNameError, match=r"robot 'rihgt' .*\['left', 'right'\]"):
@@ -445,31 +391,28 @@ class TestCombining:
 
 
 class TestErrors:
-    @pytest.mark.parametrize(
-        ("settings", "error", "message"),
-        [
-            ({"links": "tip"}, DataError, "links is a sequence of names, got 'tip'"),
-            ({"links": ("tip", "tip")}, DataError, "links names something twice"),
-            ({"links": ("nose",)}, UnknownNameError, "link 'nose' is not in .* 'flange'"),
-            ({"base": "nose"}, UnknownNameError, "base link 'nose' is not in the URDF"),
-            ({"joints": ["lift", "knee"]}, UnknownNameError, "'knee' is not in .*'elbow'"),
-            ({"joints": ["weld"]}, UnknownNameError, "'weld' is not in the movable joints"),
-            ({"joints": ["lift", "lift"]}, DataError, "joints names something twice"),
-            ({"joints": ["wag_too"]}, DataError, "mimics 'elbow'.* choose or lock 'elbow'"),
-            ({"locked": {"knee": 0.0}}, UnknownNameError, "joint 'knee'"),
-            ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
-            ({"locked": {"lift": math.nan}}, DataError, "finite numbers, got .*'lift': nan"),
-            ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
-            ({"coordinates": ["elbow"]}, DataError, "'elbow' moves link 'tip'.* of its own"),
-            ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
-            ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
-            ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),
-            ({"tools": {"cup": ("arm", np.zeros((2, 3)))}}, ShapeError, "one constant pose"),
-            ({"tools": {"cup": ("arm", [0, 0])}}, ShapeError, "position"),
-            ({"tools": {"cup": "arm"}}, DataError, "tool 'cup' is"),
-            ({"dtype": torch.float16}, DataError, "float16"),
-        ],
-    )
+    @pytest.mark.parametrize(("settings", "error", "message"), [
+        ({"links": "tip"}, DataError, "links is a sequence of names, got 'tip'"),
+        ({"links": ("tip", "tip")}, DataError, "links names something twice"),
+        ({"links": ("nose",)}, UnknownNameError, "link 'nose' is not in .* 'flange'"),
+        ({"base": "nose"}, UnknownNameError, "base link 'nose' is not in the URDF"),
+        ({"joints": ["lift", "knee"]}, UnknownNameError, "'knee' is not in .*'elbow'"),
+        ({"joints": ["weld"]}, UnknownNameError, "'weld' is not in the movable joints"),
+        ({"joints": ["lift", "lift"]}, DataError, "joints names something twice"),
+        ({"joints": ["wag_too"]}, DataError, "mimics 'elbow'.* choose or lock 'elbow'"),
+        ({"locked": {"knee": 0.0}}, UnknownNameError, "joint 'knee'"),
+        ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
+        ({"locked": {"lift": math.nan}}, DataError, "finite numbers, got .*'lift': nan"),
+        ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
+        ({"coordinates": ["elbow"]}, DataError, "'elbow' moves link 'tip'.* of its own"),
+        ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
+        ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
+        ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),
+        ({"tools": {"cup": ("arm", np.zeros((2, 3)))}}, ShapeError, "one constant pose"),
+        ({"tools": {"cup": ("arm", [0, 0])}}, ShapeError, "position"),
+        ({"tools": {"cup": "arm"}}, DataError, "tool 'cup' is"),
+        ({"dtype": torch.float16}, DataError, "float16"),
+    ])  # fmt: skip
     def test_wrong_settings(
         self, settings: dict[str, Any], error: type[Exception], message: str
     ) -> None:
@@ -479,10 +422,8 @@ class TestErrors:
     def test_a_wrong_number_of_joints_names_those_expected(self) -> None:
         with pytest.raises(ShapeError, match=r"\(\.\.\., 5\).*'lift', 'swivel'.*got \(2, 4\)"):
             zoo().state(torch.zeros(2, 4))
-        with pytest.raises(ShapeError, match=r"got \(\)"):
-            zoo().state(torch.zeros(()))
+        refused(lambda: zoo().state(torch.zeros(())), ShapeError, r"got \(\)")
 
     @pytest.mark.parametrize("value", [math.nan, math.inf])
     def test_joints_that_are_not_finite(self, value: float) -> None:
-        with pytest.raises(DataError, match="NaN or infinite"):
-            zoo().state([0.0, value, 0.0, 0.0, 0.0])
+        refused(lambda: zoo().state([0.0, value, 0.0, 0.0, 0.0]), DataError, "NaN or infinite")

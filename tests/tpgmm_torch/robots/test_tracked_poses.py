@@ -1,15 +1,13 @@
 """Poses in place of a robot: the joint vector is the poses themselves."""
 
-import copy
-import json
 import math
-import pickle
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from tests.support.refusals import refused
 from tpgmm_torch import AbsoluteOrientation, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
@@ -96,16 +94,13 @@ def test_zero_quaternions_are_refused() -> None:
 
 
 def test_wrong_joint_vectors_are_refused() -> None:
-    with pytest.raises(ShapeError, match=r"'left.qw'.*got \(13,\)"):
-        Poses().state(torch.zeros(13))
-    with pytest.raises(DataError, match="NaN"):
-        Poses().state(torch.full((14,), math.nan))
+    refused(lambda: Poses().state(torch.zeros(13)), ShapeError, r"'left.qw'.*got \(13,\)")
+    refused(lambda: Poses().state(torch.full((14,), math.nan)), DataError, "NaN")
 
 
 @pytest.mark.parametrize("links", ["left", (), ("left", "left")])
 def test_wrong_links_are_refused(links: Any) -> None:
-    with pytest.raises(DataError, match="links is a sequence of different names"):
-        Poses(links)
+    refused(lambda: Poses(links), DataError, "links is a sequence of different names")
 
 
 def test_made_in_inference_mode_it_serves_gradients() -> None:
@@ -141,27 +136,8 @@ class TestRecordedPoses:
         for shapes in ((4, 5), (4, None), ((2, 2), (2, 2)), ()):
             sizes = [(s,) if isinstance(s, int) else s or () for s in shapes]
             recorded = {str(i): Frame(torch.zeros(*size, 3)) for i, size in enumerate(sizes)}
-            with pytest.raises(ShapeError, match="one common leading shape"):
-                Poses.joints(recorded)
-
-
-class TestObject:
-    def test_config_is_json_and_gives_the_same_poses(self) -> None:
-        poses = Poses(("a", "b"), orientation=False, dtype=torch.float32)
-        again = Poses.from_config(json.loads(json.dumps(poses.config())))
-        assert again == poses and hash(again) == hash(poses)
-        assert again.lower.dtype == torch.float32
-
-    @pytest.mark.parametrize(
-        ("change", "message"), [({"color": "red"}, "color"), ({"dtype": "int8"}, "int8")]
-    )
-    def test_a_tampered_config_is_refused(self, change: dict[str, Any], message: str) -> None:
-        with pytest.raises(DataError, match=message):
-            Poses.from_config(Poses().config() | change)
-
-    @pytest.mark.parametrize("copied", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
-    def test_copies_are_equal_and_work(self, copied: Any) -> None:
-        poses = Poses()
-        other, joints = copied(poses), random_joints(poses)
-        assert other == poses
-        assert (other.state(joints).jacobians == poses.state(joints).jacobians).all()
+            refused(
+                lambda recorded=recorded: Poses.joints(recorded),
+                ShapeError,
+                "one common leading shape",
+            )

@@ -18,6 +18,7 @@ from tests.support.carrying import (
     scenes,
 )
 from tests.support.local_coordinates import local_coordinates
+from tests.support.refusals import refused
 from tests.support.worlds import LEFT, RIGHT, upper_body
 from tpgmm_control import Controller
 from tpgmm_control.sensing.inputs import Inputs
@@ -369,8 +370,7 @@ def test_names_that_do_not_exist_are_refused():
         holding.advance(1.0, joints, given={"bottle": "tail"})
     with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in"):
         begun(holds=[Hold("cup", HAND)])
-    with pytest.raises(DataError, match="twice at once"):
-        begun(holds=[HELD, replace(HELD, link=RIGHT)])
+    refused(lambda: begun(holds=[HELD, replace(HELD, link=RIGHT)]), DataError, "twice at once")
 
 
 def ticks_of(model) -> tuple[int, int]:

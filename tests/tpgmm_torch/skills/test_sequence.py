@@ -7,6 +7,7 @@ import torch
 
 from tests.support.fetching import skill as of
 from tests.support.fetching import skills
+from tests.support.refusals import refused
 from tests.support.skills import canonical, handlings, hands_model, wave, waves
 from tpgmm_control import Controller, rollout
 from tpgmm_torch import Canonical, Frame, Hold, SelectOperators, Sequence
@@ -67,17 +68,14 @@ def test_controllers_localise_in_it():
 def test_parts_that_do_not_follow_are_refused():
     model, shown = canonical(n_components=6), waves()
     for cuts, message in (([1.0, 0.5], "follow on each other"), ([3.0], "is not after")):
-        with pytest.raises(DataError, match=message):
-            fit_parts(model, shown, cuts)
-    with pytest.raises(UnknownNameError, match="'grasp'"):
-        fit_parts(model, shown, ["grasp"])
+        refused(lambda cuts=cuts: fit_parts(model, shown, cuts), DataError, message)
+    refused(lambda: fit_parts(model, shown, ["grasp"]), UnknownNameError, "'grasp'")
     with pytest.raises(DataError, match="need a component each"):
         fit_parts(canonical(n_components=1), shown, [1.0])
     with pytest.raises(DataError, match="operators for 1 of 2 parts"):
         fit_parts(model, shown, [1.0], [[Canonical()]])
     early, _, late = fit_parts(model, shown, [0.7, 1.4]).skills
-    with pytest.raises(DataError, match="cannot follow"):
-        Sequence((early, late))
+    refused(lambda: Sequence((early, late)), DataError, "cannot follow")
 
 
 def test_skills_that_were_learned_separately_each_keep_their_time():
@@ -120,8 +118,7 @@ def test_a_line_of_text_is_a_sequence():
         ("pick retry 1 from home, home", "from itself or from a skill before it"),
         ("pick, pick", "2 skills need a name each"),
     ):
-        with pytest.raises(DataError, match=message):
-            Sequence.parse(wrong, skills())
+        refused(lambda wrong=wrong: Sequence.parse(wrong, skills()), DataError, message)
     for wrong, message in (
         ("lift", "'lift'.*pick"),
         ("pick until holds", "'holds'.*arrived"),
@@ -129,21 +126,16 @@ def test_a_line_of_text_is_a_sequence():
         ("pick until contact:foot", "'contact:foot'.*contact:hand"),
         ("pick retry 1 from lift", "'lift'.*pick"),
     ):
-        with pytest.raises(UnknownNameError, match=message):
-            Sequence.parse(wrong, skills())
+        refused(lambda wrong=wrong: Sequence.parse(wrong, skills()), UnknownNameError, message)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"until": ["held"]}, "until has 1 entries for 2 skills"),
-        ({"retry": [-1, 0]}, "a number of times"),
-        ({"timeout": 0.0}, "a positive fade and timeout"),
-        ({"fade": float("nan")}, "a positive fade and timeout"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"until": ["held"]}, "until has 1 entries for 2 skills"),
+    ({"retry": [-1, 0]}, "a number of times"),
+    ({"timeout": 0.0}, "a positive fade and timeout"),
+    ({"fade": float("nan")}, "a positive fade and timeout"),
+])  # fmt: skip
 def test_what_makes_no_sequence_is_refused(options, message):
-    with pytest.raises(DataError, match=message):
-        Sequence((of("pick"), of("home")), **options)
+    refused(lambda: Sequence((of("pick"), of("home")), **options), DataError, message)
     with pytest.raises(UnknownNameError, match=r"condition 3 .* a function"):
         Sequence((of("pick"), of("home")), until=3)

@@ -6,6 +6,7 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
 from tests.support.errands import HAND, motion
+from tests.support.refusals import refused
 from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.data.arrays import as_array
@@ -162,9 +163,7 @@ def test_other_events_stay_and_new_demonstrations_are_served():
 def test_clones_and_what_is_refused():
     found = clone(Segmentation(agreement=0.9))
     assert found.agreement == 0.9
-    with pytest.raises(NotFittedError, match="call fit"):
-        found.transform([])
-    with pytest.raises(NotFittedError, match="call fit"):
-        found.report()
+    refused(lambda: found.transform([]), NotFittedError, "call fit")
+    refused(lambda: found.report(), NotFittedError, "call fit")
     with pytest.raises(ValueError, match="agreement"):
         Segmentation(agreement=2).fit(pick_and_place(2)[0])

@@ -23,11 +23,9 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
     quaternions,
-    save,
 )
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Wrench
-from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.regression.posture import PostureCost
@@ -180,17 +178,6 @@ def test_gradients_are_finite_where_nothing_is_left_to_turn_and_elsewhere():
         )
         assert all(bool(g.isfinite().all()) for g in gradients)
         assert all(float(g.abs().max()) > 0 for g in gradients)
-
-
-def test_a_model_is_what_it_was_after_saving_it(tmp_path):
-    skill = model(RELATIVE, ABSOLUTE)
-    save(skill, tmp_path / "skill")
-    again = load_model(tmp_path / "skill")
-    assert again.operators_ == skill.operators_
-    shown = recordings(seed=3, count=2)
-    np.testing.assert_array_equal(again.score_samples(shown), skill.score_samples(shown))
-    start, frames = shown[0].joints[0], dict(shown[0].frames)
-    assert torch.equal(reproduce(again, start, frames), reproduce(skill, start, frames))
 
 
 def test_batches_lie_about_the_mean_of_the_first():

@@ -162,23 +162,24 @@ def test_what_does_not_go_together_is_refused():
     rng = np.random.default_rng(7)
     cell = so101_cell(1.0, rng)
     joints, seen = cell.recorded(10, rng)
-    twice = {"front": [*seen["front"][:-1], Detections(twice=frozenset([12]))]}
-    with pytest.raises(DataError, match=r"sees tags twice, by picture \{9: \[12\]\}"):
-        calibrated(cell, rng, (joints, twice))
-    with pytest.raises(UnknownNameError, match="'side'"):
-        calibrated(cell, rng, (joints, {"side": seen["front"]}))
-    with pytest.raises(DataError, match="9 pictures for 10 rows"):
-        calibrated(cell, rng, (joints, {"front": seen["front"][1:]}))
-    with pytest.raises(UnknownNameError, match="'l_hand'"):
-        calibrated(cell, rng, (joints, seen), mounts={"cube": Mount(CUBE, "l_hand")})
-    with pytest.raises(DataError, match="nothing moves"):
-        calibrated(cell, rng, (joints, seen), mounts={"cube": Mount(CUBE)})
-    with pytest.raises(DataError, match="share numbers of tags"):
-        calibrated(cell, rng, (joints, seen), mounts={n: Mount(CUBE, HAND) for n in "ab"})
-    with pytest.raises(DataError, match="no camera sees tags of"):
-        other = Mount(Target({7: CUBE.corners[10]}), HAND)
-        calibrated(cell, rng, (joints, seen), mounts={"cube": Mount(CUBE, HAND), "o": other})
+    pictures, held, other = seen["front"], Mount(CUBE, HAND), Target({7: CUBE.corners[10]})
+    twice = [*pictures[:-1], Detections(twice=frozenset([12]))]
+    for shown, options, error, message in (
+        ({"front": twice}, {}, DataError, r"sees tags twice, by picture \{9: \[12\]\}"),
+        ({"side": pictures}, {}, UnknownNameError, "'side'"),
+        ({"front": pictures[1:]}, {}, DataError, "9 pictures for 10 rows"),
+        (seen, {"mounts": {"cube": Mount(CUBE, "l_hand")}}, UnknownNameError, "'l_hand'"),
+        (seen, {"mounts": {"cube": Mount(CUBE)}}, DataError, "nothing moves"),
+        (seen, {"mounts": {"a": held, "b": held}}, DataError, "share numbers of tags"),
+        (
+            seen,
+            {"mounts": {"cube": held, "o": Mount(other, HAND)}},
+            DataError,
+            "no camera sees tags of",
+        ),
+        (seen, {"bases": ["right_"]}, DataError, "begin with 'right_'"),
+    ):
+        with pytest.raises(error, match=message):
+            calibrated(cell, rng, (joints, shown), **options)
     with pytest.raises(DataError, match=r"shape \(n, 17\), those of \['waist_roll'"):
         calibrate_cell(robot_named("upper_body"), joints, seen, cell.described(), mounts(cell))
-    with pytest.raises(DataError, match="begin with 'right_'"):
-        calibrated(cell, rng, (joints, seen), bases=["right_"])

@@ -5,8 +5,8 @@ from tests.support.drawn_tags import CAMERA, drawn, look_at
 from tpgmm_datasets.robots import so101_urdf
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_vision.cell import camera_content, cell_from, pose_content
-from tpgmm_vision.detection.tag_source import TagSource, camera_poses
+from tpgmm_vision.cell import camera_content, camera_poses, cell_from, pose_content
+from tpgmm_vision.detection.tag_source import TagSource
 from tpgmm_vision.poses import inverse, pose_matrix, pose_vector, rigid
 from tpgmm_vision.sources import pose_source
 from tpgmm_vision.targets import target_from
@@ -97,19 +97,19 @@ def test_a_camera_on_a_link_moves_with_it():
 
 
 def test_bad_cells_and_pictures_are_refused():
-    rng = np.random.default_rng(3)
-    with pytest.raises(DataError, match="tpgmm calibrate cell"):
-        TagSource(cell_from(content(cameras={"front": camera_content(CAMERA, KEY)})))
-    with pytest.raises(DataError, match="no objects"):
-        TagSource(cell_from(content(objects={})))
     arm = Robot.from_urdf(so101_urdf(), ["gripper_frame_link"])
-    with pytest.raises(DataError, match="another robot"):
-        TagSource(cell_from(content(joints=["waist_yaw"])), arm)
-    source = pose_source(cell_from(content()))
-    images = picture(None, rng)
+    unplaced = {"cameras": {"front": camera_content(CAMERA, KEY)}}
+    for make, changes, error, message in (
+        (TagSource, unplaced, DataError, "tpgmm calibrate cell"),
+        (TagSource, {"objects": {}}, DataError, "no objects"),
+        (lambda c: TagSource(c, arm), {"joints": ["waist_yaw"]}, DataError, "another robot"),
+        (pose_source, {"source": "lidar"}, UnknownNameError, "source 'lidar'"),
+    ):
+        with pytest.raises(error, match=message):
+            make(cell_from(content(**changes)))
+    source, rng = pose_source(cell_from(content())), np.random.default_rng(3)
+    [shown] = picture(None, rng).values()
     with pytest.raises(UnknownNameError, match=r"observation\.images\.front"):
-        source.poses({"observation.images.side": images[KEY]}, {}, 0.0)
+        source.poses({"observation.images.side": shown}, {}, 0.0)
     with pytest.raises(DataError, match="640 x 480 pixels, got 320 x 240"):
-        source.poses({KEY: images[KEY][::2, ::2]}, {}, 0.0)
-    with pytest.raises(UnknownNameError, match="source 'lidar'"):
-        pose_source(cell_from(content(source="lidar")))
+        source.poses({KEY: shown[::2, ::2]}, {}, 0.0)

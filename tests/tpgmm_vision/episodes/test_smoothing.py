@@ -21,15 +21,11 @@ def smooth_step(share):
 
 def carried(seed):
     """Poses of a hand and of an object that it carries, true and with the noise of a camera."""
-    come, go, leave = (
-        smooth_step((TIME - begin) / length)[:, None]
-        for begin, length in ((0, 2.5), (TAKEN, 3), (6.5, 2))
-    )
+    parts = ((0, 2.5), (TAKEN, 3), (6.5, 2))
+    shares = [smooth_step((TIME - begin) / length)[:, None] for begin, length in parts]
+    come, go, leave = shares
     way = np.array([[0.1, -0.3, 0.4], [0.3, 0, 0.1], [0.35, 0.25, 0.12], [0.1, 0.2, 0.4]])
-    place = way[0] + sum(
-        share * step
-        for share, step in zip((come, go, leave), np.diff(way, axis=0), strict=True)
-    )
+    place = way[0] + sum(a * b for a, b in zip(shares, np.diff(way, axis=0), strict=True))
     place[:, 2] += 0.15 * np.sin(np.pi * go[:, 0]) ** 2
     yaw = 0.5 * come[:, 0] + 0.8 * go[:, 0] - 0.4 * leave[:, 0]
     hand = np.array([rigid([0.3 * a, 0.1, a], p) for a, p in zip(yaw, place, strict=True)])
@@ -124,14 +120,15 @@ def test_a_slow_motion_is_no_rest():
 
 def test_what_was_never_seen_or_first_seen_late_is_refused():
     noisy, _, hands = carried(0)
-    with pytest.raises(DataError, match="never seen"):
-        smoothed(noisy, TIME < 0, hands)
-    with pytest.raises(DataError, match=r"first seen 2\.80 s after the start, standing, and a"):
-        smoothed(noisy, TIME >= 2.8, hands)
-    with pytest.raises(DataError, match=r"first seen 1\.00 s after the start, standing, and a"):
-        smoothed(noisy, TIME >= 1, {})  # nobody knows where hands were
-    with pytest.raises(DataError, match=r"first seen 4\.00 s after the start, moving"):
-        smoothed(noisy, TIME >= 4, hands)
+    late = r"first seen {}\.00 s after the start, "
+    for seen, given, message in (
+        (TIME < 0, hands, "never seen"),
+        (TIME >= 2.8, hands, r"first seen 2\.80 s after the start, standing, and a"),
+        (TIME >= 1, {}, late.format(1) + "standing, and a"),  # nobody knows where hands were
+        (TIME >= 4, hands, late.format(4) + "moving"),
+    ):
+        with pytest.raises(DataError, match=message):
+            smoothed(noisy, seen, given)
 
 
 def test_what_no_hand_has_touched_stood_where_it_is_first_seen():

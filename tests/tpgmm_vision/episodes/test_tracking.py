@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,12 +65,9 @@ def written(path, **changed):
 def test_poses_are_those_of_the_object(tracked):
     shown = load_lerobot(tracked[0])
     for one, (rows, covered, shift) in zip(shown, EPISODES, strict=True):
-        true = pose_vector(carried(rows, covered, shift)[2])
-        assert (
-            np.linalg.norm(one.frames["cup"].position.numpy() - true[:, :3], axis=1).max()
-            < 2e-3
-        )
-        turned = np.abs((one.frames["cup"].orientation.numpy() * true[:, 3:]).sum(axis=1))
+        true, cup = pose_vector(carried(rows, covered, shift)[2]), one.frames["cup"]
+        assert np.linalg.norm(cup.position.numpy() - true[:, :3], axis=1).max() < 2e-3
+        turned = np.abs((cup.orientation.numpy() * true[:, 3:]).sum(axis=1))
         assert np.degrees(2 * np.arccos(turned.min())) < 5  # flat, seen from the front
 
 
@@ -78,9 +76,8 @@ def test_columns_say_what_was_seen_and_what_was_inferred(tracked):
     description = describe_lerobot(out)
     assert not description.problems
     assert description.frames == ("cup",)
-    assert {"tracking.seen", "tracking.known", "tracking.residual"} <= {
-        column.key for column in description.columns
-    }
+    keys = {column.key for column in description.columns}
+    assert {"tracking.seen", "tracking.known", "tracking.residual"} <= keys
     for report, (rows, covered, _) in zip(reports, EPISODES, strict=True):
         hidden = [row for a, b in covered for row in range(a, b + 1)]
         track = report.tracks["cup"]
@@ -137,10 +134,8 @@ def test_the_cell_and_a_report_with_pictures_are_beside(tracked, cell):
 
 def test_events_and_holds_are_found_in_tracks(tracked):
     shown = load_lerobot(tracked[0], robot=ROBOT)
-    starts = [
-        one.events["lift"] for one in find_events(shown, {"lift": parse_event("moving:cup")})
-    ]
-    assert np.allclose(starts, 0.8, atol=0.16)
+    lifted = find_events(shown, {"lift": parse_event("moving:cup")})
+    assert np.allclose([one.events["lift"] for one in lifted], 0.8, atol=0.16)
     [hold] = find_holds(shown, ROBOT)
     assert (hold.frame, hold.link) == ("cup", "hand")
     assert 0.5 < hold.begin < 0.9
@@ -154,9 +149,8 @@ def test_without_a_robot_what_is_covered_on_the_way_stays_unknown(original, cell
     assert known == [True, False, False]
     done = run("dataset", "track", original, tmp_path / "again", "--cell", cell)
     assert done.exit_code == 0
-    assert "in episodes 1,2, and their last poses are repeated. With --robot" in " ".join(
-        done.stderr.split()
-    )
+    said = " ".join(done.stderr.split())
+    assert "in episodes 1,2, and their last poses are repeated. With --robot" in said
 
 
 def test_episodes_that_cannot_be_tracked_are_named_and_nothing_is_written(cell, tmp_path):
@@ -189,18 +183,15 @@ def test_a_camera_that_was_moved_is_noticed(tmp_path):
 
 
 def test_tags_that_are_there_twice_are_said(tmp_path, monkeypatch):
-    from tests.support import recorded_tags
-
     shown, hands, _ = carried(40)
     other = rigid([0, 0, 0], [0.12, -0.08, 0.0])
     # tag 9 is drawn with the pattern of the object's
-    plain = cv2_marker = recorded_tags.cv2.aruco.generateImageMarker
-    monkeypatch.setattr(
-        recorded_tags.cv2.aruco,
-        "generateImageMarker",
-        lambda family, number, *rest: plain(family, NUMBER if number == 9 else number, *rest),
-    )
-    assert cv2_marker is plain
+    plain = cv2.aruco.generateImageMarker
+
+    def draw(family, number, *rest):
+        return plain(family, NUMBER if number == 9 else number, *rest)
+
+    monkeypatch.setattr(cv2.aruco, "generateImageMarker", draw)
     episodes = [([{**tags, 9: other} for tags in shown], hands)]
     root = record(tmp_path / "set", episodes, codec="h264")
     with pytest.raises(DatasetError, match=r"never seen: tag 3 is seen twice"):
@@ -212,20 +203,16 @@ def test_what_cannot_be_is_refused_at_once(tracked, original, cell, tmp_path):
         track_lerobot(tracked[0], tmp_path / "out", cell, ROBOT)
     with pytest.raises(DatasetError, match="exists; remove it"):
         track_lerobot(original, tracked[0], cell, ROBOT)
-    content = cell_content()
-    content["cameras"]["front"]["size"] = [640, 480]
-    wrong = written(tmp_path / "size.json", **content)
-    with pytest.raises(DataError, match="calibrated for 640 x 480 pixels, got 320 x 240"):
-        track_lerobot(original, tmp_path / "out", wrong, ROBOT)
-    content = cell_content()
-    content["cameras"]["front"]["key"] = "observation.images.top"
-    wrong = written(tmp_path / "key.json", **content)
-    with pytest.raises(DatasetError, match=r"no pictures \['observation\.images\.top'\]"):
-        track_lerobot(original, tmp_path / "out", wrong, ROBOT)
-    wrong = written(tmp_path / "joint.json", joint_offsets={"elbow": 0.1})
-    with pytest.raises(DatasetError, match="'elbow' is not among the values"):
-        track_lerobot(original, tmp_path / "out", wrong, ROBOT)
-    wrong = written(tmp_path / "robot.json", joints=["shoulder_pan"])
-    with pytest.raises(DataError, match="another robot"):
-        track_lerobot(original, tmp_path / "out", wrong, ROBOT)
+    large, top = cell_content(), cell_content()
+    large["cameras"]["front"]["size"] = [640, 480]
+    top["cameras"]["front"]["key"] = "observation.images.top"
+    for content, error, message in (
+        (large, DataError, "calibrated for 640 x 480 pixels, got 320 x 240"),
+        (top, DatasetError, r"no pictures \['observation\.images\.top'\]"),
+        ({"joint_offsets": {"elbow": 0.1}}, DatasetError, "'elbow' is not among the values"),
+        ({"joints": ["shoulder_pan"]}, DataError, "another robot"),
+    ):
+        wrong = written(tmp_path / "wrong.json", **content)
+        with pytest.raises(error, match=message):
+            track_lerobot(original, tmp_path / "out", wrong, ROBOT)
     assert not (tmp_path / "out").exists()

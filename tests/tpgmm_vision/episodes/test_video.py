@@ -136,7 +136,7 @@ def test_a_video_that_does_not_fit_the_rows_is_refused(root):
 
 def test_a_video_of_another_rate_or_that_ends_early_is_refused(root):
     shown = read(root, 0)
-    for rate, count, message in ((24, 81, "no picture is at"), (FPS, 60, "no picture is at")):
+    for rate, count in ((24, 81), (FPS, 60)):
         with av.open(str(root / VIDEO), "w") as made:
             stream = made.add_stream("libx264", rate=rate)
             stream.width, stream.height = 320, 240
@@ -144,7 +144,7 @@ def test_a_video_of_another_rate_or_that_ends_early_is_refused(root):
                 image = shown[row % len(shown)][KEY]
                 made.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
             made.mux(stream.encode())
-        with pytest.raises(DatasetError, match=f"episode 2.*{message}"):
+        with pytest.raises(DatasetError, match=r"episode 2.*no picture is at"):
             read(root, 2)
 
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import ast
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import Parameter, getdoc, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
-from tpgmm_tools.arguments.help import HELP_ALL, Command, Help
+from tpgmm_tools.arguments.help import HELP_ALL, Command
 
 if TYPE_CHECKING:
     from tpgmm_control.obstacles import Scene
@@ -26,14 +25,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.skills.skill import Skill
 
 
-#: Options that most people need: a command's ``--help`` lists those of them that it has.
-BASIC = (
-    "out", "robot", "link", "frame", "units", "episodes", "operator", "n_components",
-    "alignment", "format_", "dataset", "situations", "situation", "object_", "live", "joint",
-    "cell", "rate", "n_situations", "n_demonstrations", "random_state", "name", "board",
-    "tag", "cube", "size", "hand", "check", "env", "policies", "demonstrations", "seeds",
-    "budget", "conditions",
-)  # fmt: skip
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
@@ -209,13 +200,6 @@ def refuse(message: str) -> Exception:
     return DataError(message)
 
 
-def filter_plausibility(action: str) -> None:
-    """Show, make an error of, or ignore what is unlikely about recordings."""
-    from tpgmm_torch.exceptions import PlausibilityWarning
-
-    warnings.filterwarnings("always" if action == "warn" else action, "", PlausibilityWarning)  # type: ignore[arg-type]
-
-
 def command(
     app: typer.Typer, example: str
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -252,11 +236,10 @@ def command(
 
         text = (getdoc(function) or "").partition("Parameters\n---")[0]
         run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
-        about = Help(run.__doc__, example, parameters, BASIC)
         parameters = [*parameters, HELP_ALL]
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
-        app.command(cls=type("Command", (Command,), {"about": about}))(run)
+        app.command(cls=Command, epilog=example)(run)
         return function
 
     return add
@@ -283,15 +266,19 @@ def _entries(documented: Any) -> dict[str, tuple[str, str]]:
 
 def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> Parameter:
     """Add what typer must know to a parameter: ``X`` in its type is shown as its value."""
-    text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text).replace("[", "\\[")
+    text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text)
+    name = one.name.rstrip("_").replace("_", "-")
     settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
     if shown := re.search("``(.+)``", kind):
         settings["metavar"] = shown[1]
+    elif one.kind is Parameter.KEYWORD_ONLY:
+        settings["metavar"] = _value_name(one.annotation)
+    else:
+        settings["metavar"] = name.upper()
     if least := re.search(r">= (\S+)", kind):
         settings["min"] = type(one.default or 0.5)(float(least[1]))
     if one.annotation is Any:
         settings["parser"] = value
-    name = one.name.rstrip("_").replace("_", "-")
     negation = f"/--no-{name}" if one.default is True else ""
     if one.kind is Parameter.KEYWORD_ONLY:
         info = typer.Option(f"--{name}{negation}", **settings)
@@ -299,6 +286,14 @@ def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> P
         info = typer.Argument(**settings)
     annotation: Any = Annotated[one.annotation, info]
     return one.replace(kind=Parameter.KEYWORD_ONLY, annotation=annotation)
+
+
+def _value_name(kind: Any) -> str | None:
+    """Return what stands for a value in the help; None where typer lists the values."""
+    kinds = {int: "INTEGER", float: "NUMBER"}
+    if get_origin(kind) is Literal:
+        return None
+    return next((kinds[one] for one in (kind, *get_args(kind)) if one in kinds), "TEXT")
 
 
 def value(text: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import warnings
+from importlib import import_module
 from importlib.metadata import EntryPoint, version
 from typing import Annotated, Any
 
@@ -12,24 +13,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tpgmm_tools.arguments import plugins
-from tpgmm_tools.cli import (
-    calibrate,
-    camera,
-    dataset,
-    demo,
-    fit,
-    plot,
-    report,
-    reproduce,
-    sequence,
-    view,
-)  # fmt: skip
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
 ORDER = (
     "demo", "fit", "sequence", "reproduce", "report", "plot", "view", "app", "dataset",
     "camera", "calibrate",
 )  # fmt: skip
+#: Those of them that hold commands of their own.
+GROUPS = ("dataset", "camera", "calibrate")
 #: Those above this room, imported when they run; and lines in ``--help`` of such commands.
 LATE = {"app": EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS)}
 HELP = {
@@ -138,10 +129,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (demo, fit, plot, report, reproduce, sequence, view):
-    app.registered_commands += module.app.registered_commands
-for module in (calibrate, camera, dataset):
-    app.add_typer(module.app, name=module.__name__.rpartition(".")[2])
+for name in ORDER:
+    if name not in LATE:
+        members = import_module(f"tpgmm_tools.cli.{name}").app
+        if name in GROUPS:
+            app.add_typer(members, name=name)
+        else:
+            app.registered_commands += members.registered_commands
 
 
 @app.callback()

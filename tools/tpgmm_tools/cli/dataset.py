@@ -289,16 +289,14 @@ def track(
     joint_name : ``STORED=JOINT``
         The robot's name of a stored joint, as of 'tpgmm fit', repeatable.
     """
+    from tpgmm_datasets.text import parse_joint_names, parse_units
     from tpgmm_torch.checks.report import in_columns
     from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_vision.episodes.report import table
     from tpgmm_vision.episodes.tracking import track_lerobot
 
     robot = described.read()
-    given = options.DataOptions(units=units, joint_name=joint_name).arguments(robot)
-    reading = {
-        key: given[key] for key in ("units", "calibration", "joint_names") if key in given
-    }
+    reading = {**parse_units(units or ()), "joint_names": parse_joint_names(joint_name or ())}
     with options.show_progress("tracking") as progress:
         reports = track_lerobot(path, out, cell, robot, **reading, progress=progress)
     typer.echo(in_columns(table(reports)))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,8 +32,6 @@ EXAMPLE = (
     "tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand --frame bottle "
     "--n-components 30 --out out/model"
 )
-#: Fields of :class:`ModelOptions` that are no parameters of the model.
-CHOSEN = ("parts", "modes", "epsilon")
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,8 @@ class ModelOptions:
         from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
         printed = self.fusion == "covariance"
-        settings = {name: given for name, given in asdict(self).items() if name not in CHOSEN}
+        known = signature(TaskParameterizedGMM).parameters
+        settings = {name: given for name, given in asdict(self).items() if name in known}
         settings["fusion"] = CovarianceFusion(self.epsilon) if printed else InformationFusion()
         if self.n_components == "auto":
             settings["n_components"] = 10
@@ -178,6 +179,7 @@ def fit(
     """
     from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.signals import Signals
+    from tpgmm_torch.exceptions import PlausibilityWarning
     from tpgmm_torch.mixture.processes import joined_processes
     from tpgmm_torch.persistence import save
     from tpgmm_torch.structure import choices as structure
@@ -185,7 +187,8 @@ def fit(
     write = model_format(format_)
     choices = settings.choices(operator == ["auto"])
     choices.check(batch_episodes)
-    options.filter_plausibility(plausibility)
+    action: Any = "always" if plausibility == "warn" else plausibility
+    warnings.filterwarnings(action, "", PlausibilityWarning)
     robot, holds = described.read(), _parse_holds(hold)
     operators = _parse_operators(operator)
     model = settings.model(operators, robot)
@@ -316,8 +319,7 @@ def _sum_up_holds(shown: Demonstration, default: bool) -> str:
 
 def _place(frame: Any) -> str:
     """Return where a frame's poses come from."""
-    at = getattr(frame, "at", None) or getattr(frame, "feature", None)
-    return at or "given"
+    return getattr(frame, "at", None) or getattr(frame, "feature", None) or "given"
 
 
 def _sum_up_units(joints: Any, names: Sequence[str]) -> str:

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import typer
 
 from tpgmm_tools.arguments import options
-
-if TYPE_CHECKING:
-    from tpgmm_torch.operators import Operator
-    from tpgmm_torch.robots.kinematics import Kinematics
-
 
 app = typer.Typer()
 
@@ -52,7 +47,7 @@ def plot(
         How episodes are brought onto one clock, as for 'tpgmm fit'.
     """
     from tpgmm_control.loop.rollout import rollout
-    from tpgmm_tools.plotting import figure, legend, plot_candidates, plot_local, save
+    from tpgmm_tools import plotting
     from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.operators.text import format_operator
@@ -71,53 +66,18 @@ def plot(
     drawings = {}
     labels = [fill(format_operator(operator), 60) for operator in fitted.operators_]
     for index, operator in enumerate(fitted.operators_):
-        names = coordinate_names(operator, kinematics)
-        drawings[f"operator_{index + 1}"] = drawing = figure(
+        names = plotting.coordinate_names(operator, kinematics)
+        drawings[f"operator_{index + 1}"] = drawing = plotting.figure(
             len(names), labels[index], height=1.3
         )
         for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
-            plot_local(axes, fitted, index, column, demonstrations, [motion])
+            plotting.plot_local(axes, fitted, index, column, demonstrations, [motion])
             axes.set_ylabel(name, fontsize="small")
     for name in joint or ():
         title = f"{name}: each operator's estimate, and the result"
-        drawings[f"joint_{name}"] = drawing = figure(1, title, height=3.2)
-        plot_candidates(drawing.axes[0], trajectory, name, labels)
+        drawings[f"joint_{name}"] = drawing = plotting.figure(1, title, height=3.2)
+        plotting.plot_candidates(drawing.axes[0], trajectory, name, labels)
     out.mkdir(parents=True, exist_ok=True)
     for name, drawing in drawings.items():
-        legend(drawing)
-        typer.echo(save(drawing, out / f"{name}.{format_}"))
-
-
-def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
-    """Return a label for each local coordinate of an operator.
-
-    Parameters
-    ----------
-    operator, kinematics : Operator, Kinematics
-        Whose coordinates, for which robot.
-    """
-    from tpgmm_torch import operators as kinds
-
-    match operator:
-        case kinds.Stack():
-            return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
-        case kinds.Canonical():
-            names = kinematics.joint_names
-            return [names[column] for column in operator.columns(names)]
-        case kinds.AbsolutePosition() | kinds.RelativePosition():
-            return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
-    return _other_names(operator, kinematics)
-
-
-def _other_names(operator: Any, kinematics: Kinematics) -> list[str]:
-    """Label forces, parts of rotation vectors and quaternions, and number all else."""
-    from tpgmm_torch import operators as kinds
-
-    if isinstance(operator, kinds.Wrench):
-        forces = [f"{operator.link}\nforce {'xyz'[axis]} [N]" for axis in operator.axes or ()]
-        return [*forces, f"{operator.link}\ncontact"]
-    if operator.rotation_vector_starts(kinematics) == (0,):
-        return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
-    if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):
-        return [f"{operator.link}\nq{part}" for part in "wxyz"]
-    return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]
+        plotting.legend(drawing)
+        typer.echo(plotting.save(drawing, out / f"{name}.{format_}"))

@@ -29,7 +29,7 @@ EXAMPLE = (
     'A file of situations: [{"joints": {"elbow": 0.3, ...}, "frames": {"bottle": '
     '{"position": [0.3, 0, 0.1], "orientation": [1, 0, 0, 0]}}}, ...]; joints may also be a '
     "list in the model's order."
-).replace("[", "\\[")
+)
 
 
 @options.command(app, EXAMPLE)
@@ -129,7 +129,7 @@ def _choose_ways(skill: Any, situations: list[Situation]) -> Iterator[object]:
 
 def _report_contacts(scene: Scene, *motions: Any) -> None:
     """Print what touches obstacles; end with an exit code of its own if anything does."""
-    from tpgmm_tools.contacts import contacts
+    from tpgmm_tools.report import contacts
 
     found = list(contacts(scene, *motions))
     for number, contact in found:

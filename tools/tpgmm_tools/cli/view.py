@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
 
 import typer
 
@@ -12,7 +11,6 @@ from tpgmm_tools.arguments import options
 
 app = typer.Typer()
 
-SUFFIXES = {"html": ".html", "rerun": ".rrd"}
 EXAMPLE = (
     "tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 1"
     "\n\n"
@@ -26,7 +24,7 @@ def view(
     *,
     data: options.DataOptions,
     out: Path | None = None,
-    format_: Literal["html", "rerun"] = "html",
+    format_: str = "html",
     dataset: str | None = None,
     situations: Path | None = None,
     situation: int = 0,
@@ -40,18 +38,17 @@ def view(
 
     Writes one HTML file that needs nothing else: the robot from its URDF, objects, demonstrated
     and reproduced paths, ellipsoids of two standard deviations along the path, a time line,
-    curves of stiffness, of each operator's share and of what is held. With --format rerun,
-    the same as a recording for Rerun's viewer.
+    curves of stiffness, of each operator's share and of what is held.
 
     Parameters
     ----------
     model : ``DIR``
         A model that 'tpgmm fit' saved, or what 'tpgmm demo' wrote: a folder with model/ and
         dataset/.
-    out : ``FILE``
-        Where it goes; default DIR.html or DIR.rrd.
-    format_ : str
-        A page, or a Rerun recording (.rrd) of the same.
+    out : ``FILE.html``
+        Where it goes; default DIR.html.
+    format_ : ``html``
+        The only one that is left.
     dataset : str
         A LeRobot data set: demonstrated paths, and their situations.
     situations : ``FILE.json``
@@ -68,13 +65,19 @@ def view(
     port : int
         First port to try, with --live.
     """
-    from tpgmm_tools.viewing import LiveView, write_motion, write_rerun
+    from tpgmm_tools.viewing import LiveView, write_motion
 
-    suffix = SUFFIXES[format_]
-    folder, place = model, out or Path(f"{model}{suffix}")
+    if format_ != "html":
+        raise options.refuse(
+            f"a motion is written as one HTML file, not as {format_!r}: leave --format out"
+        )
+    folder, place = model, out or Path(f"{model}.html")
+    if place.suffix != ".html":
+        raise options.refuse(f"--out ends in .html, got {str(place)!r}")
     if (folder / "model").is_dir() and (folder / "dataset").is_dir():
         model, dataset = folder / "model", dataset or str(folder / "dataset")
-    _check(place, suffix, live, shown=bool(dataset or situations))
+    if not (dataset or situations):
+        raise options.refuse("give --dataset DATASET or --situations FILE.json: what to show")
     fitted = options.load_one_thread(model)
     known, shown = options.read_situations(situations, dataset, data, fitted.kinematics_)
     options.check_situation(situation, len(known))
@@ -85,20 +88,7 @@ def view(
             typer.echo(f"open {served.url} in a browser; stop with Ctrl-C")
             served.run()
         return
-    write = write_rerun if format_ == "rerun" else write_motion
     title = f"{folder.resolve().name}, situation {situation}"
-    time = write(place, fitted, known[situation], shown, title=title, **how).time
+    time = write_motion(place, fitted, known[situation], shown, title=title, **how).time
     size = place.stat().st_size / 1e6
     typer.echo(f"{float(time[-1] - time[0]):.1f} s of motion, {size:.1f} MB, in {place}")
-
-
-def _check(place: Path, suffix: str, live: bool, shown: bool) -> None:
-    """Refuse a file of another kind, what does not go together, and nothing to show."""
-    if place.suffix != suffix:
-        raise options.refuse(f"--out ends in {suffix}, got {str(place)!r}")
-    if suffix == SUFFIXES["rerun"] and live:
-        raise options.refuse(
-            "--live serves a page, --format rerun writes a file: give one of them"
-        )
-    if not shown:
-        raise options.refuse("give --dataset DATASET or --situations FILE.json: what to show")

@@ -29,16 +29,9 @@ from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
 from tpgmm_tools.paper.figures import draw_figures
 from tpgmm_tools.paper.sinusoid import sinusoid
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Hold,
-    Situation,
-    TaskParameterizedGMM,
-    Trajectory,
-    save,
-)
+from tpgmm_torch import Demonstration, Frame, Hold, Situation, TaskParameterizedGMM, save
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.training.hold_detection import with_holds

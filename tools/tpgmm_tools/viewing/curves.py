@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 
-import numpy as np
-
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_tools.plotting import operator_labels
 from tpgmm_torch.data.arrays import Array, as_array
@@ -25,27 +23,8 @@ OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
-    """One quantity over time.
-
-    Parameters
-    ----------
-    label : str
-        Empty if the panel's title says it all.
-    color : str
-        As CSS has it.
-    values : ndarray of shape (T,)
-        Not negative.
-    """
-
-    label: str
-    color: str
-    values: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Panel:
-    """Curves over one time axis.
+    """Curves over one time axis, which are not negative.
 
     Parameters
     ----------
@@ -53,15 +32,15 @@ class Panel:
         What they show, with its unit.
     time : ndarray of shape (T,)
         Since the start of the motion [s].
-    curves : sequence of Curve
-        In one unit.
+    curves : sequence of (str, ndarray of shape (T,))
+        In one unit, with their names; "" if the title says it all.
     top : float
         Where the vertical axis ends, which begins at 0.
     """
 
     title: str
     time: Array
-    curves: Sequence[Curve]
+    curves: Sequence[tuple[str, Array]]
     top: float
 
 
@@ -122,23 +101,18 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
         matrix = Impedance(model.kinematics_).joints.matrix(trajectory.covariance)
         stiffness = as_array(matrix.diagonal(dim1=-2, dim2=-1)[:, turning].mean(-1))
         title = "stiffness, mean of the joints [N m/rad]"
-        top = float(stiffness.max())
-        panels.append(Panel(title, time, [Curve("", STIFFNESS, stiffness)], top))
+        panels.append(Panel(title, time, [("", stiffness)], float(stiffness.max())))
     labels = operator_labels(of_joints(model.operators_))
-    decided = zip(labels, trajectory.candidates, strict=True)
-    shares = [
-        Curve(label, color, as_array(100 * candidate.share.mean(-1)))
-        for (label, candidate), color in zip(decided, cycle(OPERATORS), strict=False)
-    ]
-    panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
+    shares = [as_array(100 * candidate.share.mean(-1)) for candidate in trajectory.candidates]
+    title = "share of each operator, mean of the joints [%]"
+    panels.append(Panel(title, time, [*zip(labels, shares, strict=True)], 100.0))
     if model.holds_:
         skill = as_array(trajectory.time)
-        holds = [(hold.begin <= skill) & (skill <= hold.end) for hold in model.holds_]
+        names = [f"{one.frame} by {one.link}" for one in model.holds_]
         held = [
-            Curve(f"{hold.frame} by {hold.link}", color, one.astype(float))
-            for hold, one, color in zip(model.holds_, holds, cycle(OPERATORS), strict=False)
+            ((one.begin <= skill) & (skill <= one.end)).astype(float) for one in model.holds_
         ]
-        panels.append(Panel("held", time, held, 1.0))
+        panels.append(Panel("held", time, [*zip(names, held, strict=True)], 1.0))
     return panels
 
 
@@ -184,24 +158,19 @@ def _figure(panel: Panel, marks: Sequence[Mark]) -> str:
         f"<title>{html.escape(mark.label)}</title></line>"
         for mark in marks
     )
-    lines = "".join(
-        f'<polyline stroke="{curve.color}" points="{_points(panel.time, curve.values)}"/>'
-        for curve in panel.curves
-    )
-    names = "".join(
-        f'<div><span style="color:{curve.color}">&#9632;</span> '
-        f"{html.escape(curve.label)}</div>"
-        for curve in panel.curves
-        if curve.label
-    )
+    lines = names = ""
+    for (label, values), color in zip(panel.curves, cycle(OPERATORS), strict=False):
+        shown = color if label else STIFFNESS
+        points = " ".join(
+            f"{at:.6g},{value:.6g}" for at, value in zip(panel.time, values, strict=True)
+        )
+        lines += f'<polyline stroke="{shown}" points="{points}"/>'
+        if label:
+            text = html.escape(label)
+            names += f'<div><span style="color:{shown}">&#9632;</span> {text}</div>'
     return (
         f'<div class="row"><span>{html.escape(panel.title)}</span><span>{top:.0f}</span></div>'
         f'<svg viewBox="0 0 {end:.6g} {top:.6g}" preserveAspectRatio="none">'
         f'<g transform="translate(0 {top:.6g}) scale(1 -1)">{lines}{marked}'
         f'<line class="now" y2="{top:.6g}" visibility="hidden"/></g></svg>{names}'
     )
-
-
-def _points(time: Array, values: Array) -> str:
-    rows = np.column_stack((time, values))
-    return " ".join(f"{at:.6g},{value:.6g}" for at, value in rows)

@@ -19,7 +19,14 @@ import numpy as np
 from tpgmm_control.loop.command import Command
 from tpgmm_control.loop.controller import Controller
 from tpgmm_tools.viewing.curves import as_html, motion_marks, motion_panels
-from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
+from tpgmm_tools.viewing.scene import (
+    COLORS,
+    STANDARD_DEVIATIONS,
+    THICKNESSES,
+    Drawing,
+    MotionScene,
+    Node,
+)
 from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array
@@ -163,8 +170,9 @@ def draw(
         if path not in nodes:
             nodes[path] = _add_node(scene, path, node, drawing.size, on_drag)
     for path, lines in drawing.lines.items():
+        kind = path.split("/")[1]
         scene.add_line_segments(
-            path, points=lines.points, colors=lines.color, thickness=lines.thickness,
+            path, points=lines, colors=COLORS[kind], thickness=THICKNESSES[kind],
             thickness_units="screen",
         )  # fmt: skip
     for path, some in drawing.ellipsoids.items():

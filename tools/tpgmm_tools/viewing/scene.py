@@ -34,6 +34,8 @@ COLORS: Mapping[str, Color] = {
 OBSTACLE_COLOR: Color = (110, 110, 110)
 #: Obstacles that can be drawn.
 DRAWN = ("box", "sphere", "cylinder", "capsule")
+#: Of paths [pixels].
+THICKNESSES = {"demonstrations": 1.2, "reproduction": 3.5}
 #: Half axes of the ellipsoids, in standard deviations.
 STANDARD_DEVIATIONS = 2.0
 #: Ellipsoids along a path, and points of a path.
@@ -65,15 +67,6 @@ class Node:
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
-    """Line segments: ``points`` (N, 2, 3) [m], a ``color``, a ``thickness`` [pixels]."""
-
-    points: Array
-    color: Color
-    thickness: float
-
-
-@dataclass(frozen=True, eq=False)
 class Ellipsoids:
     """``centres`` (N, 3) [m], ``half_axes`` (N, 3) [m] and ``orientations`` (N, 4)."""
 
@@ -94,8 +87,8 @@ class Drawing:
         Instants of the pictures, since the start [s].
     nodes : mapping of str to Node
         Links and objects.
-    lines, ellipsoids : mapping of str to Lines, mapping of str to Ellipsoids
-        Paths of the links of interest, and where these may be.
+    lines, ellipsoids : mapping of str to ndarray (N, 2, 3), mapping of str to Ellipsoids
+        Segments of the paths of the links of interest [m], and where these may be.
     axes : mapping of str to ndarray of shape (N, 7)
         Where objects were in the demonstrations.
     size : float
@@ -109,7 +102,7 @@ class Drawing:
     trajectory: Trajectory
     time: Array
     nodes: Mapping[str, Node]
-    lines: Mapping[str, Lines]
+    lines: Mapping[str, Array]
     ellipsoids: Mapping[str, Ellipsoids]
     axes: Mapping[str, Array]
     size: float
@@ -194,8 +187,8 @@ class MotionScene:
         few = np.linspace(0, len(steps) - 1, min(ELLIPSOIDS, len(steps))).astype(int)
         covariance = trajectory.covariance.cpu().to(joints)[steps[few]]
         for link in self._links:
-            path = _segments(time, as_array(every.position(link)))
-            lines[f"/reproduction/{_node(link)}"] = Lines(path, COLORS["reproduction"], 3.5)
+            path = as_array(every.position(link))
+            lines[f"/reproduction/{_node(link)}"] = _segments(time, path)
             half_axes, turns = map(as_array, ellipsoids(state[few], covariance, link))
             centres = as_array(state.position(link))[few]
             where[f"/covariance/{_node(link)}"] = Ellipsoids(
@@ -266,14 +259,11 @@ class MotionScene:
                 poses = np.where(free[:, None], poses, there)
             yield name, np.atleast_2d(poses)
 
-    def _demonstrated_paths(self) -> Iterator[tuple[str, Lines]]:
+    def _demonstrated_paths(self) -> Iterator[tuple[str, Array]]:
         for index, link in enumerate(self._links if self._shown else ()):
             pairs = zip(self._shown, self._paths, strict=True)
-            points = np.concatenate(
-                [_segments(one.time, path[:, index]) for one, path in pairs]
-            )
-            lines = Lines(points, COLORS["demonstrations"], 1.2)
-            yield f"/demonstrations/{_node(link)}", lines
+            segments = [_segments(one.time, path[:, index]) for one, path in pairs]
+            yield f"/demonstrations/{_node(link)}", np.concatenate(segments)
 
     def _demonstrated_frames(self) -> Iterator[tuple[str, Array]]:
         """Collect where objects stood at first: why paths differ."""

@@ -31,6 +31,10 @@ STUDENT = 5.0
 SMALL_CHANGE, ROUNDS, STEPS = 0.05, 12, 8
 
 
+#: Rows of some corners, and the matrix that belongs to them.
+Blocks = list[tuple[slice, Array]]
+
+
 @dataclass(frozen=True)
 class Noise:
     """Standard deviations of corners [pixels] and of joints [rad]."""
@@ -65,11 +69,10 @@ class Adjustment:
 
     def covariance(self) -> Array:
         """Compute the covariance of a step (n_steps, n_steps), zero where it is not free."""
-        free, found = self.problem.free, np.zeros((self.problem.n_steps,) * 2)
-        weak = np.zeros(len(free))
-        weak[: self.problem.offsets.start] = np.tile(
-            np.repeat(POSE_PRIOR, 3) ** -2.0, self.problem.n_poses
-        )
+        problem, free = self.problem, self.problem.free
+        found, weak = np.zeros((len(free), len(free))), np.zeros(len(free))
+        poses = np.repeat(POSE_PRIOR, 3) ** -2.0
+        weak[: problem.offsets.start] = np.tile(poses, problem.n_poses)
         jacobian = self.jacobian[:, free]
         normal = jacobian.T @ jacobian + np.diag(weak[free])
         found[np.ix_(free, free)] = np.linalg.inv(normal)
@@ -150,7 +153,7 @@ def _errors(problem: Reprojection, state: Array) -> tuple[Array, Array]:
 
 def _covariances(
     problem: Reprojection, jacobian: Array, noise: Noise, weights: Array, starts: Integers
-) -> list[tuple[slice, Array]]:
+) -> Blocks:
     """Compute the covariances of errors of corners from each start to the next [pixels^2]."""
     moved = noise.joints * jacobian[..., problem.offsets].reshape(2 * len(weights), -1)
     variance = noise.pixels**2 / np.repeat(weights, 2)
@@ -158,9 +161,7 @@ def _covariances(
     return [(own, np.diag(variance[own]) + moved[own] @ moved[own].T) for own in blocks]
 
 
-def _whitening(
-    problem: Reprojection, state: Array, noise: Noise, weights: Array
-) -> list[tuple[slice, Array]]:
+def _whitening(problem: Reprojection, state: Array, noise: Noise, weights: Array) -> Blocks:
     """For the corners of each posture a matrix that makes their noise independent."""
     _, jacobian = _errors(problem, state)
     blocks = _covariances(problem, jacobian, noise, weights, _starts(problem))
@@ -174,9 +175,7 @@ def _starts(problem: Reprojection) -> Integers:
     return np.concatenate(([0], changes, [len(postures)]))
 
 
-def _whiten(
-    problem: Reprojection, state: Array, whitening: list[tuple[slice, Array]]
-) -> tuple[Array, Array]:
+def _whiten(problem: Reprojection, state: Array, whitening: Blocks) -> tuple[Array, Array]:
     """Errors in units of their noise, and how steps lessen them."""
     errors, jacobian = _errors(problem, state)
     table = np.column_stack((errors.ravel(), jacobian.reshape(errors.size, -1)))

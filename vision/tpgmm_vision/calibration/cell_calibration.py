@@ -18,7 +18,6 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.calibration.adjustment import OFFSET_PRIOR, Adjustment, adjust
 from tpgmm_vision.calibration.reprojection import Corners, Reprojection
-from tpgmm_vision.camera import Camera
 from tpgmm_vision.cell import CellCamera
 from tpgmm_vision.detection.estimation import View, estimate_pose
 from tpgmm_vision.detection.tags import Detections
@@ -46,6 +45,9 @@ HARDLY = np.radians(15.0)
 #: By how much the logarithm of the likelihood must rise for a cause to be believed: of a scale,
 #: and of a pose that changed on the way, which can do so at any picture.
 SCALE_EVIDENCE, STEP_EVIDENCE = 8.0, 25.0
+
+#: Posture, camera and target of each picture of a target.
+Pictures = Iterable[tuple[int, int, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +105,8 @@ class CellCalibration:
     expected: Mapping[tuple[str, int], dict[int, Array]]
 
     def __str__(self) -> str:
-        far, turned = (
-            np.quantile(values, (0.5, 0.95))
-            for values in (1e3 * self.position_errors, np.degrees(self.angle_errors))
-        )
+        far = np.quantile(1e3 * self.position_errors, (0.5, 0.95))
+        turned = np.quantile(np.degrees(self.angle_errors), (0.5, 0.95))
         offsets = ", ".join(
             f"{name} {np.degrees(value):+.2f} +- {np.degrees(self.uncertainty[name]):.2f}"
             for name, value in self.joint_offsets.items()
@@ -156,9 +156,9 @@ def calibrate_cell(
     UnknownNameError
         If there is no such camera or link.
     """
-    given = np.asarray(joints, dtype=float), robot, seen, cameras, mounts, bases
+    given = np.asarray(joints, dtype=float), robot, seen, cameras, mounts
     _check(*given)
-    task = _Task(*given)
+    task = _Task(*given, bases)
     first = adjust(task.problem, task.start(), robust=True)
     wrong = first.misfit > WRONG_TAG**2
     problem = replace(task.problem, corners=task.problem.corners.of(np.repeat(~wrong, 4)))
@@ -190,22 +190,46 @@ class _Task:
         cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
     ) -> None:  # fmt: skip
         self.cameras, self.mounts, self.bases = list(seen), list(mounts), bases
-        lenses = [cameras[name].camera for name in seen]
-        targets, shown = [mount.target for mount in mounts.values()], list(seen.values())
-        rows = _collect_rows(shown, targets)
-        pictures = dict.fromkeys(row[:3] for row in rows)
-        self._check_pictures(pictures, len(joints))
-        self.views = _estimate_views(pictures, lenses, targets, shown)
-        *places, pixels, points = zip(*rows, strict=True)
-        corners = Corners(
-            np.concatenate(pixels), np.concatenate(points), *np.repeat(np.array(places), 4, 1)
-        )
         carriers = [cameras[name].link for name in seen]
         carriers += [mount.link for mount in mounts.values()]
-        arms = [{link for link in robot.links if link.startswith(base)} for base in bases]
-        self.problem = Reprojection(robot, joints, corners, lenses, carriers, arms)
+        _check_links(robot, carriers if seen and mounts else [], bases)
+        self.lenses, self.shown = [cameras[name].camera for name in seen], [*seen.values()]
+        self.targets = [mount.target for mount in mounts.values()]
+        rows = self._collect_rows()
+        pictures = dict.fromkeys(row[:3] for row in rows)
+        self._check_pictures(pictures, len(joints))
+        self.views = self._estimate_views(pictures)
+        *places, pixels, points = zip(*rows, strict=True)
+        seen_at = map(np.concatenate, (pixels, points))
+        corners = Corners(*seen_at, *np.repeat(np.array(places), 4, 1))
+        arms = [_find_arm(robot, base) for base in bases]
+        self.problem = Reprojection(robot, joints, corners, self.lenses, carriers, arms)
 
-    def _check_pictures(self, pictures: Iterable[tuple[int, int, int]], total: int) -> None:
+    def _collect_rows(self) -> list[tuple[int, int, int, int, Array, Array]]:
+        """Collect what pictures show: posture, camera, target and tag; pixels and points."""
+        return [
+            (k, i, j, number, found.corners[number], target.corners[number])
+            for k, at_posture in enumerate(zip(*self.shown, strict=True))
+            for i, found in enumerate(at_posture)
+            for j, target in enumerate(self.targets)
+            for number in found.corners.keys() & target.corners.keys()
+        ]
+
+    def _estimate_views(self, pictures: Pictures) -> dict[tuple[int, int], list[Any]]:
+        """Estimate the poses of targets in pictures: postures and poses, by both."""
+        views = defaultdict[tuple[int, int], list[Any]](list)
+        for k, i, j in pictures:
+            view = View(self.lenses[i], np.eye(4), self.shown[i][k].corners)
+            if estimate := estimate_pose([view], self.targets[j]):
+                views[i, j].append((estimate.valid, k, estimate.pose))
+        for pair, found in views.items():
+            # poses that cannot be trusted count only where there are too few others
+            good = [row for row in found if row[0]]
+            _, *columns = zip(*(good if len(good) >= LEAST_PICTURES else found), strict=True)
+            views[pair] = list(map(np.array, columns))
+        return views
+
+    def _check_pictures(self, pictures: Pictures, total: int) -> None:
         """Refuse a camera that sees too little, and a target that no camera sees."""
         for i, name in enumerate(self.cameras):
             if (n := len({k for k, at, _ in pictures if at == i})) < LEAST_PICTURES:
@@ -260,12 +284,11 @@ class _Task:
         """Solve for the poses of a camera in its carrier and of a target in the hand."""
         found = list[tuple[float, Array, Array]]()
         hand, seen = hand_from_carrier[:, :3], camera_from_target[:, :3]
+        solve: Any = cv2.calibrateHandEye
+        lists = [*hand[..., :3]], [*hand[..., 3]], [*seen[..., :3]], [*seen[..., 3]]
         for method in CLOSED_FORMS:
             with suppress(cv2.error):
-                turn, place = cv2.calibrateHandEye(
-                    [*hand[..., :3]], [*hand[..., 3]], [*seen[..., :3]], [*seen[..., 3]],
-                    method=method,
-                )  # fmt: skip
+                turn, place = solve(*lists, method=method)
                 if np.isfinite(place).all() and np.linalg.det(turn) > 0.5:
                     poses = hand_from_carrier @ rigid(turn, place) @ camera_from_target
                     target, _ = mean_pose(poses)
@@ -370,20 +393,17 @@ class _Task:
         poses, offsets, _ = problem.split(fit.state)
         spread = np.diag(fit.covariance())[problem.offsets] ** 0.5
         names, moves = np.array(problem.robot.joint_names), self.problem.free[problem.offsets]
-        known, errors = (
-            dict(zip(names[moves].tolist(), values[moves].tolist(), strict=True))
-            for values in (offsets, spread)
-        )
+        moving = names[moves].tolist()
+        known = dict(zip(moving, offsets[moves].tolist(), strict=True))
+        errors = dict(zip(moving, spread[moves].tolist(), strict=True))
         pixels, c = self.problem.expect_pixels(fit.state)[0], self.problem.corners
         expected = defaultdict[tuple[str, int], dict[int, Array]](dict)
         for k in range(0, len(pixels), 4):
             place = self.cameras[c.camera[k]], int(c.posture[k])
             expected[place][int(c.number[k])] = pixels[k : k + 4]
         parts = np.split(poses, [n, len(problem.carriers)])
-        cameras, mounts, bases = (
-            dict(zip(names, part, strict=True))
-            for names, part in zip((self.cameras, self.mounts, self.bases), parts, strict=True)
-        )
+        called = zip((self.cameras, self.mounts, self.bases), parts, strict=True)
+        cameras, mounts, bases = (dict(zip(*each, strict=True)) for each in called)
         return CellCalibration(
             cameras, mounts, bases, known, errors, tuple(names[unknown].tolist()),
             np.linalg.norm(np.array(away)[:, :3, 3], axis=1),
@@ -392,42 +412,9 @@ class _Task:
         )  # fmt: skip
 
 
-def _collect_rows(
-    shown: Sequence[Sequence[Detections]], targets: Sequence[Target]
-) -> list[tuple[int, int, int, int, Array, Array]]:
-    """Collect what pictures show: posture, camera, target and tag; pixels and points."""
-    return [
-        (k, i, j, number, found.corners[number], target.corners[number])
-        for k, at_posture in enumerate(zip(*shown, strict=True))
-        for i, found in enumerate(at_posture)
-        for j, target in enumerate(targets)
-        for number in found.corners.keys() & target.corners.keys()
-    ]
-
-
-def _estimate_views(
-    pictures: Iterable[tuple[int, int, int]],
-    lenses: Sequence[Camera],
-    targets: Sequence[Target],
-    shown: Sequence[Sequence[Detections]],
-) -> dict[tuple[int, int], list[Any]]:
-    """Estimate the poses of targets in pictures: postures and poses by camera and target."""
-    views = defaultdict[tuple[int, int], list[Any]](list)
-    for k, i, j in pictures:
-        view = View(lenses[i], np.eye(4), shown[i][k].corners)
-        if estimate := estimate_pose([view], targets[j]):
-            views[i, j].append((estimate.valid, k, estimate.pose))
-    for pair, found in views.items():
-        # poses that cannot be trusted count only where there are too few others
-        good = [row for row in found if row[0]]
-        _, *columns = zip(*(good if len(good) >= LEAST_PICTURES else found), strict=True)
-        views[pair] = list(map(np.array, columns))
-    return views
-
-
 def _check(
     joints: Array, robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
-    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
+    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount],
 ) -> None:  # fmt: skip
     """Refuse what does not go together."""
     if joints.shape[1:] != (robot.n_joints,) or not np.isfinite(joints).all():
@@ -441,7 +428,6 @@ def _check(
     numbers = [number for mount in mounts.values() for number in mount.target.corners]
     if len(set(numbers)) < len(numbers):
         raise DataError(f"targets share numbers of tags, got {sorted(numbers)}")
-    _check_links(robot, seen, cameras, mounts, bases)
 
 
 def _check_detections(name: str, found: Sequence[Detections], total: int) -> None:
@@ -453,16 +439,17 @@ def _check_detections(name: str, found: Sequence[Detections], total: int) -> Non
                         "the others")  # fmt: skip
 
 
-def _check_links(
-    robot: Kinematics, seen: Mapping[str, Sequence[Detections]],
-    cameras: Mapping[str, CellCamera], mounts: Mapping[str, Mount], bases: Sequence[str],
-) -> None:  # fmt: skip
+def _find_arm(robot: Kinematics, base: str) -> set[str]:
+    """Find the links whose names begin so."""
+    return {link for link in robot.links if link.startswith(base)}
+
+
+def _check_links(robot: Kinematics, links: Sequence[str | None], bases: Sequence[str]) -> None:
     """Refuse links that the robot lacks, a cell without motion, and arms without a base."""
-    links = [cameras[name].link for name in seen] + [mount.link for mount in mounts.values()]
     if unknown := {*links} - {None, *robot.links}:
         raise UnknownNameError("link", str(unknown.pop()), "the robot", robot.links)
-    if not seen or not mounts or not any(links):
+    if not any(links):
         raise DataError("no camera and no target is on a link of the robot: nothing moves")
     for base in bases:
-        if len({link.startswith(base) for link in robot.links}) < 2:
+        if len(_find_arm(robot, base)) in (0, len(robot.links)):
             raise DataError(f"links of an arm begin with {base!r}, not all; got {robot.links}")

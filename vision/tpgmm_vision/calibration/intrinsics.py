@@ -8,13 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_vision.camera import Camera
 from tpgmm_vision.detection.tags import grey
-from tpgmm_vision.poses import Array
+from tpgmm_vision.poses import Array, Picture
 from tpgmm_vision.targets import Board
 
 __all__ = ["calibrate_camera"]
@@ -70,9 +69,7 @@ class CameraCalibration:
         )
 
 
-def calibrate_camera(
-    pictures: Mapping[str, NDArray[np.uint8]], board: Board
-) -> CameraCalibration:
+def calibrate_camera(pictures: Mapping[str, Picture], board: Board) -> CameraCalibration:
     """Estimate the intrinsics of a camera.
 
     Parameters
@@ -105,9 +102,8 @@ def calibrate_camera(
     flags = 0 if errors[0] < HELPS * errors[fixed] else fixed
     camera, _, turns, uncertain = _fit_camera(views, size, flags)
     _check_tilt(turns, uncertain)
-    problems = []
-    if without or blurred:
-        problems.append(f"no board in {without}, a blurred one in {blurred}: they do not count")
+    skipped = f"no board in {without}, a blurred one in {blurred}: they do not count"
+    problems = [skipped] if without or blurred else []
     fx, fy = camera.focal_length
     if abs(fx / fy - 1) > SQUARE:
         problems.append(f"focal lengths {fx:.1f} and {fy:.1f} differ: is the print stretched? "
@@ -115,7 +111,7 @@ def calibrate_camera(
     return CameraCalibration(camera, errors[flags], tuple(views), tuple(problems))
 
 
-def _views(pictures: Mapping[str, NDArray[np.uint8]], board: Board) -> tuple[Views, list[str]]:
+def _views(pictures: Mapping[str, Picture], board: Board) -> tuple[Views, list[str]]:
     """Points of the board and their pixels in pictures that show it, and the others."""
     drawn = board.drawn
     detector, found, without = cv2.aruco.CharucoDetector(drawn), {}, list[str]()
@@ -173,9 +169,8 @@ def _fit_camera(
 ) -> tuple[Camera, dict[str, float], Array, float]:
     """Camera, error of each picture [pixels], rotations, and the share of f that is unsure."""
     points, pixels = ([part[k] for part in views.values()] for k in (0, 1))
-    found: Any = cv2.calibrateCameraExtended(
-        points, pixels, size, None, None, flags=flags, criteria=ENDS
-    )
+    fit: Any = cv2.calibrateCameraExtended
+    found = fit(points, pixels, size, None, None, flags=flags, criteria=ENDS)
     _, matrix, lens, turns, _, spread, _, errors = found
     lengths, centre = np.diag(matrix)[:2], matrix[:2, 2]
     camera = Camera(size[0], size[1], tuple(lengths), tuple(centre), tuple(lens.ravel()[:5]))

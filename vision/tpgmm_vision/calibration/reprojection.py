@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, pose_matrix, rigid
+from tpgmm_vision.poses import Array, cross_matrix, pose_matrix, rigid
 
 Integers = NDArray[np.int_]
 
@@ -43,7 +43,7 @@ class Corners:
         return Corners(**{name: getattr(self, name)[rows] for name in self.__annotations__})
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Reprojection:
     """Corners that are seen, explained by poses, offsets of joints, and scales.
 
@@ -65,9 +65,17 @@ class Reprojection:
     free : ndarray of bool, shape (n_steps,), optional
         Which entries of a step change: six for each pose, then the other numbers. By default
         all but the scales and the offsets of joints that move nothing.
+
+    Attributes
+    ----------
     links, base_of : ndarray of int
-        Indices that are found: of the link of each carrier, and of the base of each link, -1
-        where that is known.
+        Indices: of the link of each carrier, and of the base of each link, -1 where that is
+        known.
+    n_poses, n_steps : int
+        Number of poses in the state, and of entries of a step.
+    offsets, scales : slice
+        Entries of a step that are offsets of joints; that are scales, of focal lengths, then
+        that of tags.
     """
 
     robot: Kinematics
@@ -77,42 +85,21 @@ class Reprojection:
     carriers: Sequence[str | None]
     bases: Sequence[set[str]] = ()
     free: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    links: Integers = field(init=False)
-    base_of: Integers = field(init=False)
 
     def __post_init__(self) -> None:
         names = self.robot.links
         links = [len(names) if one is None else names.index(one) for one in self.carriers]
-        base_of = np.full(len(names) + 1, -1)
+        self.links, self.base_of = np.array(links), np.full(len(names) + 1, -1)
         for number, own in enumerate(self.bases):
-            base_of[[names.index(name) for name in own]] = number
-        object.__setattr__(self, "links", np.array(links))
-        object.__setattr__(self, "base_of", base_of)
+            self.base_of[[names.index(name) for name in own]] = number
+        self.n_poses = len(self.carriers) + len(self.bases)
+        self.offsets = slice(6 * self.n_poses, 6 * self.n_poses + self.robot.n_joints)
+        self.scales = slice(self.offsets.stop, None)
+        self.n_steps = self.offsets.stop + len(self.cameras) + 1
         if not len(self.free):
-            free = np.ones(self.n_steps, dtype=bool)
-            object.__setattr__(self, "free", free)
+            self.free = free = np.ones(self.n_steps, dtype=bool)
             jacobians = np.abs(self.place_links(self.nothing)[1][:, self.links])
             free[self.offsets], free[self.scales] = jacobians.max((0, 1, 2)) > 1e-9, False
-
-    @property
-    def n_poses(self) -> int:
-        """Number of poses in the state."""
-        return len(self.carriers) + len(self.bases)
-
-    @property
-    def n_steps(self) -> int:
-        """Entries of a step."""
-        return 6 * self.n_poses + self.robot.n_joints + len(self.cameras) + 1
-
-    @property
-    def offsets(self) -> slice:
-        """Entries of a step that are offsets of joints."""
-        return slice(6 * self.n_poses, 6 * self.n_poses + self.robot.n_joints)
-
-    @property
-    def scales(self) -> slice:
-        """Entries of a step that are scales: of focal lengths, then that of tags."""
-        return slice(self.offsets.stop, None)
 
     def state(self, poses: Array) -> Array:
         """Return the state of poses (n_poses, 4, 4), without offsets and scales."""
@@ -183,21 +170,23 @@ class Reprojection:
         back = camera[:, :3, :3].swapaxes(-1, -2)
         local = (back @ (world - camera[:, :3, 3])[..., None])[..., 0]
         moves = np.zeros((len(world), 3, self.n_steps))
+        ones = np.tile(np.eye(3), (len(world), 1, 1))
         for sign, part in ((-1.0, of[0]), (1.0, of[1])):
             link = self.links[part]
             arm = world - links[c.posture, link, :3, 3]
             linear, angular = np.split(jacobians[c.posture, link], 2, axis=1)
-            moves[..., self.offsets] += sign * (linear - _cross(arm) @ angular)
+            moves[..., self.offsets] += sign * (linear - cross_matrix(arm) @ angular)
             base = self.base_of[link]
             there = np.flatnonzero(base >= 0)
             columns = 6 * (len(self.carriers) + base[there, None]) + np.arange(6)
-            twist = np.concatenate((np.tile(np.eye(3), (len(world), 1, 1)), -_cross(world)), -1)
+            twist = np.concatenate((ones, -cross_matrix(world)), -1)
             moves[there[:, None], :, columns] += sign * twist[there].swapaxes(1, 2)
-        twist = np.concatenate((target[:, :3, :3], -target[:, :3, :3] @ _cross(points)), -1)
+        turn = target[:, :3, :3]
+        twist = np.concatenate((turn, -turn @ cross_matrix(points)), -1)
         moves[rows[:, None], :, 6 * of[1][:, None] + np.arange(6)] = twist.swapaxes(1, 2)
-        moves[..., -1] = (target[:, :3, :3] @ points[..., None])[..., 0]
+        moves[..., -1] = (turn @ points[..., None])[..., 0]
         seen = back @ moves
-        twist = np.concatenate((np.tile(-np.eye(3), (len(world), 1, 1)), _cross(local)), -1)
+        twist = np.concatenate((-ones, cross_matrix(local)), -1)
         seen[rows[:, None], :, 6 * of[0][:, None] + np.arange(6)] = twist.swapaxes(1, 2)
         pixels, jacobian = np.zeros((len(world), 2)), np.zeros((len(world), 2, self.n_steps))
         for number, one in enumerate(self.cameras):
@@ -209,10 +198,3 @@ class Reprojection:
             pixels[own], jacobian[own] = away + one.principal_point, scale * rates @ seen[own]
             jacobian[own, :, self.scales.start + number] = away
         return pixels, jacobian, seen
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices of cross products ``v x .`` (..., 3, 3)."""
-    made = np.zeros((*vectors.shape, 3))
-    made[..., [2, 0, 1], [1, 2, 0]], made[..., [1, 2, 0], [2, 0, 1]] = vectors, -vectors
-    return made

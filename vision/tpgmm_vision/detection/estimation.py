@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tpgmm_vision.camera import Camera
-from tpgmm_vision.poses import Array, angle_between, inverse, rigid, transform
+from tpgmm_vision.poses import Array, angle_between, cross_matrix, inverse, rigid, transform
 from tpgmm_vision.targets import Target
 
 #: How far what is known may be off: an upright axis [rad], the height of what stands [m].
@@ -35,6 +34,9 @@ LEAST_EVIDENCE = 20.0
 MOST_MISFIT, CRAFT = 5.0, 0.015
 #: A pose less certain than this is not valid: standard deviation [m] and [rad].
 MOST_UNCERTAIN = 0.003, np.radians(3)
+
+#: Whether the target is upright, and its height, where it counts what is known of them.
+Known = tuple[bool, float | None] | None
 
 
 @dataclass(frozen=True)
@@ -89,11 +91,7 @@ class PoseEstimate:
 
 
 def estimate_pose(
-    views: Sequence[View],
-    target: Target,
-    *,
-    upright: bool = False,
-    height: float | None = None,
+    views: Sequence[View], target: Target, *, upright: bool = False, height: float | None = None
 ) -> PoseEstimate | None:
     """Estimate the pose of a target from all tags that all cameras see.
 
@@ -112,20 +110,15 @@ def estimate_pose(
     PoseEstimate or None
         None if no tag of the target is seen.
     """
-    problem = _Problem.of(views, target)
-    while problem.seen:
-        fit = None
-        if upright or height is not None:
-            fit = problem.best((upright, height))
-            if fit.cost > problem.freedom + MOST_MISFIT**2 and (
-                fit.cost > (free := problem.best(None)).cost + MOST_MISFIT**2
-            ):
-                fit = free
-        fit = fit or problem.best(None)
+    known = (upright, height) if upright or height is not None else None
+    while (problem := _Problem(views, target)).seen:
+        fit = problem.fit(known)
         wrong = problem.contradicts(fit)
         if not wrong or len(problem.tags) == 1:
             return problem.judge_fit(fit, wrong)
-        problem = problem.without(problem.worst(fit.pose))
+        worst = problem.worst(fit.pose)
+        left = {number: one for number, one in target.corners.items() if number != worst}
+        target = replace(target, corners=left)
     return None
 
 
@@ -139,47 +132,25 @@ class _Fit:
     second: _Fit | None = None
 
 
-@dataclass(frozen=True)
 class _Seen:
     """The corners of a target's tags in one view.
 
     ``points`` (n, 4, 3) in the target's frame, ``pixels`` (n, 4, 2), and matrices (n, 8, 8)
-    that whiten them.
+    that ``whiten`` them.
     """
 
-    view: View
-    numbers: tuple[int, ...]
-    points: Array
-    pixels: Array
-    whiten: Array
-
-    @classmethod
-    def of(cls, view: View, target: Target, numbers: Sequence[int]) -> _Seen:
-        """Some tags of the target."""
+    def __init__(self, view: View, target: Target, numbers: Sequence[int]) -> None:
         usual = CORNER_STD**2 * np.eye(8)
         given = [(view.covariances or {}).get(number, usual) for number in numbers]
-        return cls(
-            view,
-            tuple(numbers),
-            np.array([target.corners[number] for number in numbers]),
-            np.array([view.corners[number] for number in numbers]),
-            np.linalg.inv(np.linalg.cholesky(np.array(given))),
-        )
-
-    def without(self, number: int) -> _Seen:
-        """Return the same without a tag."""
-        kept = [one != number for one in self.numbers]
-        left = tuple(one for one in self.numbers if one != number)
-        return _Seen(self.view, left, self.points[kept], self.pixels[kept], self.whiten[kept])
+        self.view, self.numbers, self._from_base = view, numbers, inverse(view.base_from_camera)
+        self.points = np.array([target.corners[number] for number in numbers])
+        self.pixels = np.array([view.corners[number] for number in numbers])
+        self.whiten = np.linalg.inv(np.linalg.cholesky(np.array(given)))
 
     def errors(self, pose: Array) -> Array:
         """Expected less seen corners (n, 4, 2) [pixels]."""
         points = transform(self._from_base @ pose, self.points.reshape(-1, 3))
         return self.view.camera.project(points).reshape(-1, 4, 2) - self.pixels
-
-    @cached_property
-    def _from_base(self) -> Array:
-        return inverse(self.view.base_from_camera)
 
     def residual(self, pose: Array) -> tuple[Array, Array]:
         """Compute errors (n, 8) in standard deviations, and their Jacobian (n, 8, 6)."""
@@ -190,40 +161,25 @@ class _Seen:
             return np.full((n, 8), 1e3), np.zeros((n, 8, 6))
         pixels, rates = self.view.camera.project_with_rates(points)
         rates = rates @ camera_from_base[:3, :3]
-        (x, y, z), zero = turned.T, np.zeros(len(turned))
         # d (w x p) / d w = -[p]x
-        cross = np.stack((zero, z, -y, -z, zero, x, y, -x, zero), axis=-1).reshape(-1, 3, 3)
-        moved = np.concatenate((rates, rates @ cross), axis=-1).reshape(n, 8, 6)
+        turns = rates @ cross_matrix(-turned)
+        moved = np.concatenate((rates, turns), axis=-1).reshape(n, 8, 6)
         error = pixels.reshape(n, 8) - self.pixels.reshape(n, 8)
         return np.einsum("nij,nj->ni", self.whiten, error), self.whiten @ moved
 
 
-@dataclass(frozen=True)
 class _Problem:
-    """All corners of a target."""
+    """All corners of a target, and the numbers of their tags."""
 
-    seen: tuple[_Seen, ...]
-
-    @classmethod
-    def of(cls, views: Sequence[View], target: Target) -> _Problem:
-        """Those of the target's tags."""
+    def __init__(self, views: Sequence[View], target: Target) -> None:
         found = [(view, sorted(view.corners.keys() & target.corners.keys())) for view in views]
-        return cls(tuple(_Seen.of(view, target, tags) for view, tags in found if tags))
-
-    @property
-    def tags(self) -> tuple[int, ...]:
-        """Numbers of the tags."""
-        return tuple(dict.fromkeys(number for one in self.seen for number in one.numbers))
+        self.seen = [_Seen(view, target, tags) for view, tags in found if tags]
+        self.tags = tuple(dict.fromkeys(number for one in self.seen for number in one.numbers))
 
     @property
     def freedom(self) -> int:
         """Number of measurements beyond those of a pose."""
         return 8 * sum(len(one.numbers) for one in self.seen) - 6
-
-    def without(self, number: int) -> _Problem:
-        """Return the same without a tag."""
-        left = (one.without(number) for one in self.seen)
-        return _Problem(tuple(one for one in left if one.numbers))
 
     def worst(self, pose: Array) -> int:
         """Find the tag that fits a pose worst."""
@@ -233,16 +189,22 @@ class _Problem:
                 costs[number] += float(errors @ errors)
         return max(costs, key=lambda number: costs[number])
 
-    def best(self, known: tuple[bool, float | None] | None) -> _Fit:
+    def fit(self, known: Known) -> _Fit:
+        """Fit the pose, without what is known where the corners contradict it."""
+        fit = self.best(known)
+        if known and fit.cost > self.freedom + MOST_MISFIT**2:
+            free = self.best(None)
+            fit = free if fit.cost > free.cost + MOST_MISFIT**2 else fit
+        return fit
+
+    def best(self, known: Known) -> _Fit:
         """Fit the hypothesis that fits best."""
         guesses = [pose for one in self.seen for pose in _hypotheses(one)]
         costs = [self.system(pose, known)[0] for pose in guesses]
         order = np.argsort(costs)
         first = self.descend(guesses[order[0]], known)
-        rivals = [
-            guesses[k] for k in order[1:] if angle_between(guesses[k], first.pose) > DISTINCT
-        ]
-        if rivals:
+        others = [guesses[k] for k in order[1:]]
+        if rivals := [one for one in others if angle_between(one, first.pose) > DISTINCT]:
             other = self.descend(rivals[0], known)
             if angle_between(other.pose, first.pose) > DISTINCT:
                 if other.cost < first.cost:
@@ -250,7 +212,7 @@ class _Problem:
                 return replace(first, second=other)
         return first
 
-    def descend(self, pose: Array, known: tuple[bool, float | None] | None) -> _Fit:
+    def descend(self, pose: Array, known: Known) -> _Fit:
         """Gauss-Newton with damping."""
         damping = 1e-3
         cost, gradient, information = self.system(pose, known)
@@ -270,9 +232,7 @@ class _Problem:
                 damping = max(10 * damping, 1e-2)
         return _Fit(pose, cost, information)
 
-    def system(
-        self, pose: Array, known: tuple[bool, float | None] | None
-    ) -> tuple[float, Array, Array]:
+    def system(self, pose: Array, known: Known) -> tuple[float, Array, Array]:
         """Sum of squares in standard deviations, its gradient / 2 and Gauss-Newton's matrix."""
         parts = [one.residual(pose) for one in self.seen]
         residual = np.concatenate([part[0].ravel() for part in parts])
@@ -284,12 +244,8 @@ class _Problem:
                 # of the axis' x and y with a small rotation: w x axis
                 turn[0, 3:], turn[1, 3:] = (0, axis[2], -axis[1]), (-axis[2], 0, axis[0])
                 # further than a quarter turn away it is no nearer
-                away = (
-                    axis[:2]
-                    if axis[2] > 0
-                    else axis[:2] / max(float(np.linalg.norm(axis[:2])), 1e-3)
-                )
-                residual = np.append(residual, away / UPRIGHT_STD)
+                far = 1 if axis[2] > 0 else max(float(np.linalg.norm(axis[:2])), 1e-3)
+                residual = np.append(residual, axis[:2] / far / UPRIGHT_STD)
                 rates = np.concatenate((rates, turn / UPRIGHT_STD))
             if height is not None:
                 residual = np.append(residual, (pose[2, 3] - height) / HEIGHT_STD)
@@ -303,10 +259,9 @@ class _Problem:
 
     def contradicts(self, fit: _Fit) -> bool:
         """Test whether the corners are not where they should be."""
-        edges = [
-            np.linalg.norm(one.pixels[:, 1] - one.pixels[:, 0], axis=1) for one in self.seen
-        ]
-        bound = CRAFT * float(np.median(np.concatenate(edges)))
+        pixels = np.concatenate([one.pixels for one in self.seen])
+        edges = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)
+        bound = CRAFT * float(np.median(edges))
         return fit.cost > MOST_MISFIT**2 * self.freedom and self.residual(fit.pose) > bound
 
     def judge_fit(self, fit: _Fit, wrong: bool) -> PoseEstimate:
@@ -314,8 +269,8 @@ class _Problem:
         misfit = fit.cost / self.freedom
         inverse_information = np.linalg.pinv(fit.information, hermitian=True)
         covariance = np.asarray(inverse_information * max(misfit, 1), dtype=float)
-        position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in
-                          (covariance[:3, :3], covariance[3:, 3:]))  # fmt: skip
+        parts = covariance[:3, :3], covariance[3:, 3:]
+        position, turn = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in parts)
         reason, alternative = "", None
         if wrong:
             reason = "the corners of its tag fit no pose"
@@ -326,10 +281,8 @@ class _Problem:
             )
         elif fit.second and fit.second.cost - fit.cost < LEAST_EVIDENCE * max(misfit, 1):
             reason, alternative = "two poses explain what is seen", fit.second.pose
-        left = self.residual(fit.pose)
-        return PoseEstimate(
-            fit.pose, covariance, left, not reason, reason, self.tags, alternative
-        )
+        found = fit.pose, covariance, self.residual(fit.pose), not reason, reason
+        return PoseEstimate(*found, self.tags, alternative)
 
 
 def _hypotheses(seen: _Seen) -> list[Array]:

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_vision.cell import Cell, CellCamera, check_robot
+from tpgmm_vision.cell import Cell, CellCamera, camera_poses, check_robot
 from tpgmm_vision.detection.estimation import PoseEstimate, View, estimate_pose
-from tpgmm_vision.detection.tags import Detections, TagDetector
+from tpgmm_vision.detection.tags import Box, Detections, TagDetector
 from tpgmm_vision.detection.tracker import Tracker
-from tpgmm_vision.poses import (
-    Array,
-    angle_between,
-    inverse,
-    pose_matrix,
-    pose_vector,
-    transform,
-)
+from tpgmm_vision.poses import Array, Picture, angle_between, inverse, pose_vector, transform
 from tpgmm_vision.sources import ObservedPose
 from tpgmm_vision.targets import Target
 
@@ -77,8 +68,8 @@ class TagSource:
             )
             for name, one in cell.objects.items()
         }
-        families = {one.target.family for one in cell.objects.values()}
-        families |= {one.target.family for one in cell.checks.values()}
+        tagged: list[Any] = [*cell.objects.values(), *cell.checks.values()]
+        families = {one.target.family for one in tagged}
         self._detectors = {family: TagDetector(family, MAGNIFY) for family in families}
         self.reset()
 
@@ -88,15 +79,12 @@ class TagSource:
         self.estimates: dict[str, PoseEstimate] = {}
         self.detections: dict[str, dict[str, Detections]] = {}
         self._trackers = {name: Tracker() for name in self._targets}
-        self._boxes: dict[str, list[tuple[int, int, int, int]] | None] = {}
+        self._boxes: dict[str, list[Box] | None] = {}
         self._moved = dict.fromkeys(self._cameras, 0)
         self._problems: dict[str, str] = {}
 
     def poses(
-        self,
-        images: Mapping[str, NDArray[np.uint8]],
-        joints: Mapping[str, float],
-        time: float,
+        self, images: Mapping[str, Picture], joints: Mapping[str, float], time: float
     ) -> dict[str, ObservedPose]:
         """Find the poses of all objects now.
 
@@ -122,47 +110,37 @@ class TagSource:
             self.detections[name] = self._detect_tags(name, images[one.key])
         self._check(places)
         found = {name: self._object(name, places, time) for name in self._targets}
-        self._boxes = {
-            name: self._around(name, one, places) for name, one in self._cameras.items()
-        }
+        cameras = self._cameras.items()
+        self._boxes = {name: self._around(one, places[name]) for name, one in cameras}
         return found
 
-    def _detect_tags(self, name: str, picture: NDArray[np.uint8]) -> dict[str, Detections]:
+    def _detect_tags(self, name: str, picture: Picture) -> dict[str, Detections]:
         """Tags in a picture: near where they were, or everywhere if that is not all."""
         before, boxes = self.detections.get(name, {}), self._boxes.get(name)
         found = {f: detect(picture, boxes) for f, detect in self._detectors.items()}
-        if boxes is None or all(
-            found[family].corners.keys() >= known.corners.keys()
-            for family, known in before.items()
-        ):
+        whole = all(found[f].corners.keys() >= one.corners.keys() for f, one in before.items())
+        if boxes is None or whole:
             return found
         return {f: detect(picture) for f, detect in self._detectors.items()}
 
     def _views(self, target: Target, places: Mapping[str, Array]) -> list[View]:
         """Views of a target by all cameras that are where they were."""
-        views = []
-        for name, one in self._cameras.items():
-            if self._moved[name]:
-                continue
-            seen = self.detections[name][target.family]
-            views.append(View(one.camera, places[name], seen.corners, seen.covariances))
-        return views
+        still = [name for name in self._cameras if not self._moved[name]]
+        return [self._view(name, target.family, places[name]) for name in still]
+
+    def _view(self, name: str, family: str, place: Array) -> View:
+        """View of the tags of a family by a camera that is in some place."""
+        seen = self.detections[name][family]
+        return View(self._cameras[name].camera, place, seen.corners, seen.covariances)
 
     def _object(self, name: str, places: Mapping[str, Array], time: float) -> ObservedPose:
         """Measure one object."""
         target, known = self._targets[name], self._cell.objects[name]
-        twice = sorted(
-            number
-            for seen in self.detections.values()
-            for number in seen[target.family].twice & target.corners.keys()
-        )
-        reason, found = "no tag of it is seen", None
-        if twice:
-            reason = f"tag {twice[0]} is seen twice"
-        else:
-            found = estimate_pose(
-                self._views(target, places), target, upright=known.upright, height=known.height
-            )
+        seen = set().union(*(one[target.family].twice for one in self.detections.values()))
+        twice = sorted(seen & target.corners.keys())
+        reason = f"tag {twice[0]} is seen twice" if twice else "no tag of it is seen"
+        views = [] if twice else self._views(target, places)
+        found = estimate_pose(views, target, upright=known.upright, height=known.height)
         self.estimates.pop(name, None)
         if found is not None:
             self.estimates[name] = found
@@ -182,7 +160,7 @@ class TagSource:
             if not self._moved[name]:
                 self._problems.pop(name, None)
             elif self._moved[name] >= CONFIRMED and name not in self._problems:
-                self._problems[name] = self._said(name, one, places[name])
+                self._problems[name] = self._said(name, places[name])
         self.problem = "; ".join(self._problems.values())
 
     def _check_error(self, name: str, one: CellCamera, place: Array) -> float | None:
@@ -197,12 +175,11 @@ class TagSource:
                 errors.append(float(np.median(away)) * depth / min(one.camera.focal_length))
         return max(errors, default=None)
 
-    def _said(self, name: str, one: CellCamera, place: Array) -> str:
+    def _said(self, name: str, place: Array) -> str:
         """Message about a camera that was moved, as far as it is seen now."""
         by = ""
         for known in self._cell.checks.values():
-            seen = self.detections[name][known.target.family]
-            view = View(one.camera, np.eye(4), seen.corners, seen.covariances)
+            view = self._view(name, known.target.family, np.eye(4))
             if found := estimate_pose([view], known.target):
                 now = known.pose @ inverse(found.pose)
                 far, turn = np.linalg.norm(now[:3, 3] - place[:3, 3]), angle_between(now, place)
@@ -212,14 +189,12 @@ class TagSource:
             "was; put it back, or run tpgmm calibrate cell again"
         )
 
-    def _around(
-        self, name: str, one: CellCamera, places: Mapping[str, Array]
-    ) -> list[tuple[int, int, int, int]] | None:
+    def _around(self, one: CellCamera, place: Array) -> list[Box] | None:
         """Choose where to look for tags; everywhere (None) unless all objects are seen."""
         seen = [name for name, found in self.estimates.items() if found.valid]
         if len(seen) < len(self._targets):
             return None
-        boxes, camera_from_base = [], inverse(places[name])
+        boxes, camera_from_base = [], inverse(place)
         found = [(self._targets[n], e.pose) for n, e in self.estimates.items()]
         found += [(check.target, check.pose) for check in self._cell.checks.values()]
         for target, pose in found:
@@ -230,43 +205,6 @@ class TagSource:
             pixels = one.camera.project(points)
             low, high = pixels.min(0), pixels.max(0)
             reach = REACH * float((high - low).max()) + 8
-            boxes.append(
-                tuple(np.round((*(low - reach), *(high + reach))).astype(int).tolist())
-            )
+            edges = np.round((*(low - reach), *(high + reach)))
+            boxes.append(tuple(edges.astype(int).tolist()))
         return boxes
-
-
-def camera_poses(
-    cell: Cell, robot: Kinematics | None, joints: Mapping[str, float]
-) -> dict[str, Array]:
-    """``base_from_camera`` (4, 4) of all cameras of a cell.
-
-    Parameters
-    ----------
-    cell : Cell
-    robot : Kinematics, optional
-        Needed where a camera is on a link.
-    joints : mapping of str to float
-        Of the robot's description, offsets included [rad].
-
-    Raises
-    ------
-    UnknownNameError
-        If a joint is missing.
-    """
-    links = {}
-    if cell.links:
-        assert robot is not None
-        for name in robot.joint_names:
-            if name not in joints:
-                raise UnknownNameError("joint", name, "the measured joints", joints)
-        values = [[joints[name] for name in robot.joint_names]]
-        state = robot.state(torch.tensor(values).to(robot.lower))
-        for link in cell.links:
-            pose = torch.cat((state.position(link), state.orientation(link)), dim=-1)
-            links[link] = pose_matrix(pose[0].double().cpu().numpy())
-    placed = {}
-    for name, one in cell.require_placed_cameras().items():
-        assert one.pose is not None
-        placed[name] = one.pose if one.link is None else links[one.link] @ one.pose
-    return placed

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError
-from tpgmm_vision.poses import Array
+from tpgmm_vision.poses import Array, Picture
 from tpgmm_vision.targets import FAMILIES, modules_of
 
 #: Pixels of the pattern on a side of a module, and white modules around its square.
@@ -34,6 +34,13 @@ FARTHEST, LEAST_EXPLAINED, MOST_UNCERTAIN = 0.2, 0.8, 0.3
 LEAST_PIXELS = 60
 #: What noise does not explain: the lens, the print, the light [pixels].
 MODEL_ERROR = 0.05
+
+#: Grey values of a part of a picture.
+Grey = NDArray[np.float32]
+#: A part of a picture: left, top, right and bottom [pixels].
+Box = tuple[int, int, int, int]
+#: Corners (4, 2) and their covariance (8, 8).
+Refined = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
@@ -92,13 +99,9 @@ class TagDetector:
         settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax = 5, 25
         settings.adaptiveThreshWinSizeStep = 10
         self._detector = cv2.aruco.ArucoDetector(self._dictionary, settings)
-        self._patterns: dict[int, NDArray[np.float32]] = {}
+        self._patterns: dict[int, Grey] = {}
 
-    def __call__(
-        self,
-        picture: NDArray[np.uint8],
-        boxes: Sequence[tuple[int, int, int, int]] | None = None,
-    ) -> Detections:
+    def __call__(self, picture: Picture, boxes: Sequence[Box] | None = None) -> Detections:
         """Find the tags in a picture.
 
         Parameters
@@ -111,14 +114,11 @@ class TagDetector:
         rough, twice = self._search(image, boxes)
         found = {n: self._refine(image, n, c) for n, c in rough.items() if n not in twice}
         good = {n: fit for n, fit in found.items() if fit is not None}
-        return Detections(
-            {n: corners for n, (corners, _) in good.items()},
-            {n: covariance for n, (_, covariance) in good.items()},
-            frozenset(twice),
-        )
+        corners, covariances = ({n: fit[k] for n, fit in good.items()} for k in (0, 1))
+        return Detections(corners, covariances, frozenset(twice))
 
     def _search(
-        self, image: NDArray[np.uint8], boxes: Sequence[tuple[int, int, int, int]] | None
+        self, image: Picture, boxes: Sequence[Box] | None
     ) -> tuple[dict[int, Array], set[int]]:
         """Search boxes for tags: their corners, and the numbers found in two places."""
         height, width = image.shape
@@ -136,7 +136,7 @@ class TagDetector:
                 rough.setdefault(number, corners)
         return rough, twice
 
-    def _rough(self, image: NDArray[np.uint8]) -> list[tuple[int, Array]]:
+    def _rough(self, image: Picture) -> list[tuple[int, Array]]:
         """Numbers and corners as OpenCV finds them."""
         times = self._magnify
         if times > 1:
@@ -147,19 +147,16 @@ class TagDetector:
         corners = [(one.reshape(4, 2).astype(float) + 0.5) / times - 0.5 for one in squares]
         return list(zip(map(int, numbers.ravel()), corners, strict=True))
 
-    def _pattern(self, number: int) -> NDArray[np.float32]:
+    def _pattern(self, number: int) -> Grey:
         """Draw the tag and white around it, 0 to 1."""
         if number not in self._patterns:
-            drawn = cv2.aruco.generateImageMarker(
-                self._dictionary, number, self._modules * TEXTURE
-            )
+            size = self._modules * TEXTURE
+            drawn = cv2.aruco.generateImageMarker(self._dictionary, number, size)
             white = np.pad(drawn, QUIET * TEXTURE, constant_values=255)
             self._patterns[number] = np.asarray(white / 255, dtype=np.float32)
         return self._patterns[number]
 
-    def _refine(
-        self, image: NDArray[np.uint8], number: int, corners: Array
-    ) -> tuple[Array, Array] | None:
+    def _refine(self, image: Picture, number: int, corners: Array) -> Refined | None:
         """Corners and their covariance; None where the pattern does not fit."""
         size = float(np.linalg.norm(corners - np.roll(corners, -1, 0), axis=1).min())
         reach = 3 + 0.3 * size
@@ -178,9 +175,7 @@ class TagDetector:
 class _Fit:
     """A pattern fitted to the grey values of a patch."""
 
-    def __init__(
-        self, patch: NDArray[np.float32], pattern: NDArray[np.float32], modules: int
-    ) -> None:
+    def __init__(self, patch: Grey, pattern: Grey, modules: int) -> None:
         self.patch, self.pattern = patch, pattern
         edge = QUIET * TEXTURE
         low, high = edge - 0.5, edge + modules * TEXTURE - 0.5
@@ -194,7 +189,7 @@ class _Fit:
         self.blur = BLUR * np.eye(2)
         self.x, self.y = (u - self.centre[0]) / self.scale, (v - self.centre[1]) / self.scale
 
-    def predict_pixels(self, corners: Array) -> NDArray[np.float32]:
+    def predict_pixels(self, corners: Array) -> Grey:
         """Predict how the pattern is seen with its corners there."""
         height, width = self.patch.shape
         fine = 3 if max(height, width) < 64 else 2 if max(height, width) < 200 else 1
@@ -208,7 +203,7 @@ class _Fit:
             seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.filter2D(seen, -1, _gaussian(self.blur)))
 
-    def run(self, corners: Array) -> tuple[Array, Array] | None:
+    def run(self, corners: Array) -> Refined | None:
         """Gauss-Newton on a projective motion of the corners, on the blur and on the light."""
         middle, mask = corners.mean(0), np.zeros(self.patch.shape, np.uint8)
         outline = np.round(middle + self.outer * (corners - middle)).astype(np.int32)
@@ -233,9 +228,8 @@ class _Fit:
             along = -(gx * u + gy * v)
             # a blur's covariance changes a picture by half its second derivatives
             bends = xx * contrast / 2, xy * contrast, yy * contrast / 2
-            system = np.stack(
-                (gx * u, gx * v, gx, gy * u, gy * v, gy, along * u, along * v, *bends, *light)
-            )
+            motions = gx * u, gx * v, gx, gy * u, gy * v, gy, along * u, along * v
+            system = np.stack((*motions, *bends, *light))
             normal, residual = system @ system.T, values - shades @ light
             normal[np.diag_indices_from(normal)] *= 1 + 1e-9
             step = np.linalg.solve(normal, system @ residual)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from tpgmm_vision.detection.estimation import PoseEstimate
-from tpgmm_vision.poses import Array, angle_between
+from tpgmm_vision.poses import angle_between
 
 #: How fast objects are moved: [m/s], [rad/s].
 SPEED, TURN = 1.5, np.radians(360)
@@ -19,37 +19,17 @@ CONFIRMED = 3
 MEMORY = 0.5
 
 
-@dataclass(frozen=True)
-class Track:
-    """Where an object is, as far as is known.
-
-    Parameters
-    ----------
-    pose : ndarray of shape (4, 4)
-    covariance : ndarray of shape (6, 6)
-        As of :class:`~tpgmm_vision.detection.estimation.PoseEstimate`.
-    seen : float
-        When it was measured last [s].
-    valid : bool
-    reason : str
-        Why it is not valid.
-    """
-
-    pose: Array
-    covariance: Array
-    seen: float
-    valid: bool
-    reason: str = ""
-
-
 class Tracker:
     """Filters the measured poses of an object."""
 
     def __init__(self) -> None:
-        self._last: Track | None = None
+        self._last: PoseEstimate | None = None
+        self._seen = 0.0  # when [s]
         self._rivals: list[PoseEstimate] = []
 
-    def update(self, found: PoseEstimate | None, time: float, reason: str = "") -> Track | None:
+    def update(
+        self, found: PoseEstimate | None, time: float, reason: str = ""
+    ) -> PoseEstimate | None:
         """Update the pose of the object.
 
         Parameters
@@ -63,26 +43,26 @@ class Tracker:
 
         Returns
         -------
-        Track or None
-            None before it was ever seen.
+        PoseEstimate or None
+            What counts, the last pose where nothing was measured, and whether it is valid; None
+            before it was ever seen.
         """
         found = self._resolve_pose(found, time)
         if found is None or not found.valid:
             return self._missing(time, reason if found is None else found.reason)
-        if self._last is not None and not self._reachable(found, time):
+        if self._last is not None and not self._reachable(found, self._last, time):
             self._rivals = [one for one in self._rivals if _agree(one, found)] + [found]
             if len(self._rivals) < CONFIRMED:
                 return self._missing(time, "it jumps: not confirmed yet")
-        self._rivals = []
-        self._last = Track(found.pose, found.covariance, time, True)
-        return self._last
+        self._rivals, self._last, self._seen = [], found, time
+        return found
 
     def _resolve_pose(self, found: PoseEstimate | None, time: float) -> PoseEstimate | None:
         """Choose from two poses that which follows what was seen shortly before."""
         last = self._last
-        if found is None or found.alternative is None or last is None:
+        if found is None or found.alternative is None:
             return found
-        if time - last.seen > MEMORY:
+        if last is None or time - self._seen > MEMORY:
             return found
         both = [found, replace(found, pose=found.alternative)]
         angles = [angle_between(one.pose, last.pose) for one in both]
@@ -91,23 +71,25 @@ class Tracker:
         clear = 2 * min(angles) < max(angles)
         return replace(near, valid=True, reason="") if clear else found
 
-    def _reachable(self, found: PoseEstimate, time: float) -> bool:
+    def _reachable(self, found: PoseEstimate, last: PoseEstimate, time: float) -> bool:
         """Test whether the object can have come there from where it was."""
-        assert self._last is not None
-        passed = max(time - self._last.seen, 0)
-        away = float(np.linalg.norm(found.pose[:3, 3] - self._last.pose[:3, 3]))
-        turned = angle_between(found.pose, self._last.pose)
+        passed = max(time - self._seen, 0)
+        away, turned = _measure_step(found, last)
         return away <= SPREAD + SPEED * passed and turned <= SPREAD_ANGLE + TURN * passed
 
-    def _missing(self, time: float, reason: str) -> Track | None:
+    def _missing(self, time: float, reason: str) -> PoseEstimate | None:
         """Return the last pose, which is not valid."""
-        last = self._last
-        if last is None:
-            return None
-        return replace(last, valid=False, reason=f"{reason}, for {time - last.seen:.1f} s")
+        reason = f"{reason}, for {time - self._seen:.1f} s"
+        return self._last and replace(self._last, valid=False, reason=reason)
 
 
 def _agree(one: PoseEstimate, other: PoseEstimate) -> bool:
     """Test whether two poses may be those of an object at rest."""
+    away, turned = _measure_step(one, other)
+    return away < SPREAD and turned < SPREAD_ANGLE
+
+
+def _measure_step(one: PoseEstimate, other: PoseEstimate) -> tuple[float, float]:
+    """Measure how far two poses are apart [m], [rad]."""
     away = float(np.linalg.norm(one.pose[:3, 3] - other.pose[:3, 3]))
-    return away < SPREAD and angle_between(one.pose, other.pose) < SPREAD_ANGLE
+    return away, angle_between(one.pose, other.pose)

@@ -24,9 +24,7 @@ SEEN_COLOUR, EXPECTED_COLOUR, WIDTH = (0, 200, 0), (255, 120, 0), 480
 AROUND, LEAST_AROUND = 2.0, 100
 #: Fractional bits of OpenCV's drawing.
 BITS = 4
-STYLE = (
-    "body{font:15px sans-serif}td{padding:0 1em;text-align:right}figure{display:inline-block}"
-)
+STYLE = "body{font:15px sans-serif}td{padding:0 1em;text-align:end}figure{display:inline-block}"
 
 
 @dataclass
@@ -112,8 +110,7 @@ def report_page(title: str, reports: Sequence[EpisodeReport]) -> str:
     for report in reports:
         page += f"<h2>Episode {report.index}</h2>"
         for caption, picture in report.pictures:
-            page += (
-                f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(picture).decode()}'
-            )
-            page += f'" alt=""><figcaption>{html.escape(caption)}</figcaption></figure>'
+            content = base64.b64encode(picture).decode()
+            page += f'<figure><img src="data:image/jpeg;base64,{content}" alt="">'
+            page += f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     return page

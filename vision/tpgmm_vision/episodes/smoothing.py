@@ -61,10 +61,8 @@ class Track:
 
     def __init__(self, time: Array) -> None:
         self.time, rows = time, len(time)
-        self.poses, self.residuals = (
-            np.tile(np.eye(4), (rows, 1, 1)),
-            np.zeros(rows, np.float32),
-        )
+        self.poses = np.tile(np.eye(4), (rows, 1, 1))
+        self.residuals = np.zeros(rows, np.float32)
         self.seen, self.known = np.zeros((2, rows), dtype=bool)
         self.reasons = [""] * rows
         self._rest, self._tolerance, self.spread = np.full(rows, -1), REST_DISTANCE, 0.0
@@ -187,9 +185,8 @@ class Track:
         lost = np.convolve(away, np.ones(ELSEWHERE), "valid") == ELSEWHERE
         count = int(np.append(lost, True).argmax())
         held = np.flatnonzero(~away[:count])
-        moved = np.linalg.norm(
-            _points(self.poses[rows[held]]) - _points(self.poses[at]), axis=1
-        )
+        way = _points(self.poses[rows[held]]) - _points(self.poses[at])
+        moved = np.linalg.norm(way, axis=1)
         if len(held) < CARRIED_FRAMES or moved.max() < CARRIED_WAY * SLIP:
             return 0, np.full((4, 4), np.nan)
         return count, mean_pose(list(inside[held[: 4 * CARRIED_FRAMES]]))[0]

@@ -25,8 +25,8 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_vision.cell import Cell, read_cell
-from tpgmm_vision.detection.tag_source import camera_poses
+from tpgmm_vision.camera import Camera
+from tpgmm_vision.cell import Cell, camera_poses, read_cell
 from tpgmm_vision.episodes.report import EpisodeReport, drawn, report_page
 from tpgmm_vision.episodes.smoothing import Track
 from tpgmm_vision.episodes.video import EpisodePictures
@@ -105,14 +105,12 @@ def track_lerobot(
     return reports
 
 
-def _offsets(
-    layout: Layout, cell: Cell, robot: Kinematics | None, joint_names: Any
-) -> dict[str, list[float]]:
+def _offsets(layout: Layout, cell: Cell, robot: Any, called: Any) -> dict[str, list[float]]:
     """Return the joint offsets of a cell for each value of states and actions."""
     declared, given = dict[str, list[float]](), cell.joint_offsets
     keys = {joint_feature(layout), kept.ACTION} & layout.features.keys()
     for key in keys if any(given.values()) else ():
-        names = names_of(layout.feature(key), joint_names, robot) or ()
+        names = names_of(layout.feature(key), called, robot) or ()
         matched = match_names(list(given), names, key)
         declared[key] = [given.get(matched.get(name, ""), 0.0) for name in names]
     return declared
@@ -123,9 +121,8 @@ class _Tracker:
 
     def __init__(self, layout: Layout, cell: Cell, robot: Any, progress: Any) -> None:
         self.cell, self.robot, self.source = cell, robot, pose_source(cell, robot)
-        self.pictures = EpisodePictures(
-            layout, [one.key for one in cell.require_placed_cameras().values()]
-        )
+        cameras = cell.require_placed_cameras().values()
+        self.pictures = EpisodePictures(layout, [one.key for one in cameras])
         self.progress, self.done = progress or (lambda done, total: None), 0
         self.total = sum(episode.length for episode in layout.episodes)
 
@@ -166,11 +163,11 @@ class _Tracker:
         wanted = report.rows_to_show()
         for row, images in self.pictures.read(rows.episode, rows.time, wanted):
             for name, place in camera_poses(self.cell, self.robot, named[row]).items():
-                expected = self._expect_corners(report, row, name, place)
-                picture = images[self.cell.cameras[name].key]
+                one = self.cell.cameras[name]
+                expected = self._expect_corners(report, row, one.camera, place)
                 said = f"row {row}, {rows.time[row]:.2f} s, {name}: {wanted[row]}"
                 seen = detected[row].get(name, {})
-                report.pictures.append((said, drawn(picture, seen, expected)))
+                report.pictures.append((said, drawn(images[one.key], seen, expected)))
         return report
 
     def _measure(
@@ -208,7 +205,7 @@ class _Tracker:
         return dict(zip(robot.links, pose_matrix(poses).swapaxes(0, 1), strict=True))
 
     def _expect_corners(
-        self, report: EpisodeReport, row: int, camera: str, place: Array
+        self, report: EpisodeReport, row: int, camera: Camera, place: Array
     ) -> dict[int, Array]:
         """Predict the pixels of the tags that do not look away from a camera."""
         expected = dict[int, Array]()
@@ -216,7 +213,7 @@ class _Tracker:
             pose = inverse(place) @ report.tracks[name].poses[row] @ inverse(thing.pose)
             for number, corners in thing.target.corners.items():
                 points = transform(pose, corners)
-                pixels = self.cell.cameras[camera].camera.project(points)
+                pixels = camera.project(points)
                 if cv2.contourArea(pixels.astype(np.float32), True) > 0 < points[:, 2].min():
                     expected[number] = pixels
         return expected

@@ -74,10 +74,9 @@ class EpisodePictures:
         DatasetError
             If a video or an image is missing or damaged, or a video does not fit the rows.
         """
-        streams = [
-            (self._video if key in self.videos else self._images)(key, episode, time)
-            for key in self.keys
-        ]
+        kinds = [self._video if key in self.videos else self._images for key in self.keys]
+        pairs = zip(kinds, self.keys, strict=True)
+        streams = [read(key, episode, time) for read, key in pairs]
         stop = None if rows is None else max(rows, default=-1) + 1
         for row, pictures in enumerate(islice(zip(*streams, strict=True), stop)):
             if rows is None or row in rows:

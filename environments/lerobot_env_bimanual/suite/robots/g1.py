@@ -99,8 +99,6 @@ def g1_spec() -> mujoco.MjSpec:
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
     for hand in HANDS:
         spec.body(hand).add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=0)
-    for geom in spec.geoms:
-        geom.contype = geom.conaffinity = 0
     return add_position_control(spec, GAIN)
 
 

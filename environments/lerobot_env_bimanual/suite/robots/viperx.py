@@ -113,8 +113,6 @@ def _arms() -> mujoco.MjSpec:
             name=hand, pos=(AHEAD, 0, 0), quat=_hand_orientation(sign).numpy()
         )
         palm.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=MASS)
-    for geom in spec.geoms:
-        geom.contype = geom.conaffinity = 0
     return spec
 
 

@@ -26,16 +26,8 @@ FPS = 25
 OTHERS = [name for name in TRIED if name != UPPER_BODY]
 #: Which of their joints are pushed.
 STRONG = {
-    "viperx": [
-        f"{side}_arm_{joint}"
-        for side in ("left", "right")
-        for joint in ("waist", "shoulder", "elbow")
-    ],
-    "g1": [
-        f"{side}_{joint}_joint"
-        for side in ("left", "right")
-        for joint in ("shoulder_pitch", "shoulder_yaw", "elbow")
-    ],
+    "viperx": ("{}_arm_{}", ("waist", "shoulder", "elbow")),
+    "g1": ("{}_{}_joint", ("shoulder_pitch", "shoulder_yaw", "elbow")),
 }
 on_others = pytest.mark.parametrize("name", OTHERS)
 
@@ -46,9 +38,8 @@ def test_kinematics_are_those_of_the_physics(name):
     data = mujoco.MjData(model)
     assert tuple(model.joint(i).name for i in range(model.njnt)) == robot.joint_names
     assert tuple(model.actuator(i).name for i in range(model.nu)) == robot.joint_names
-    np.testing.assert_allclose(
-        model.jnt_range, torch.stack((robot.lower, robot.upper), 1), rtol=1e-12
-    )
+    limits = torch.stack((robot.lower, robot.upper), 1)
+    np.testing.assert_allclose(model.jnt_range, limits, rtol=1e-12)
     for joints in np.random.default_rng(0).uniform(-1.5, 1.2, (5, robot.n_joints)):
         data.qpos[:] = joints
         mujoco.mj_kinematics(model, data)
@@ -119,7 +110,8 @@ def test_pushes_are_meant_for_strong_joints_of_both_arms(name):
     for seed in range(40):
         env.reset(seed=seed)
         pushed.add(env.joint_names[env._start.pushed])
-    assert pushed == set(STRONG[name])
+    text, joints = STRONG[name]
+    assert pushed == {text.format(side, one) for side in ("left", "right") for one in joints}
 
 
 @on_others

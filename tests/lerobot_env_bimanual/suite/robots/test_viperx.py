@@ -21,25 +21,19 @@ from tpgmm_torch.exceptions import DependencyError
 ROBOT = embodiment("viperx").robot
 
 
-def physics():
-    model = viperx_spec().compile()
-    return model, mujoco.MjData(model)
-
-
 def test_the_arms_are_gym_alohas():
     """Ranges, masses, and how links follow one another, wherever the arm stands."""
     theirs = mujoco.MjModel.from_xml_path(
         str(constants.ASSETS_DIR / "bimanual_viperx_transfer_cube.xml")
     )
-    model, data = physics()
-    seen = mujoco.MjData(theirs)
+    model = viperx_spec().compile()
+    data, seen = mujoco.MjData(model), mujoco.MjData(theirs)
     for column, name in enumerate(ROBOT.joint_names):
         side, _, joint = name.split("_", 2)
         there = theirs.joint(f"vx300s_{side}/{joint}")
         np.testing.assert_array_equal(model.joint(name).range, there.range)
-        np.testing.assert_array_equal(
-            (ROBOT.lower[column], ROBOT.upper[column]), np.float64(there.range)
-        )
+        limits = ROBOT.lower[column], ROBOT.upper[column]
+        np.testing.assert_array_equal(limits, np.float64(there.range))
         body = model.body(int(model.joint(name).bodyid[0]))
         assert body.mass == theirs.body(int(there.bodyid[0])).mass
         data.joint(name).qpos = seen.joint(there.name).qpos = 0.3
@@ -59,7 +53,7 @@ def test_one_arm_is_the_mirror_image_of_the_other():
     state = ROBOT.state(posture)
     left, right = (state.position(hand) for hand in HANDS)
     np.testing.assert_allclose(left * torch.tensor((1.0, -1.0, 1.0)), right, atol=1e-12)
-    model, _ = physics()
+    model = viperx_spec().compile()
     for side, sign in zip(SIDES, (1, -1), strict=True):
         base = model.body(f"vx300s_{side}")
         np.testing.assert_allclose(base.pos, np.multiply(BASE, (1, sign, 1)))

@@ -8,9 +8,9 @@ import torch
 from tests.support.skills import bottle_model, few_bottles, small_bottle
 from tpgmm_control import Controller
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, save
-from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 from tpgmm_torch.persistence import load_model
+from tpgmm_torch.skills.situations import check_situations
 
 ODD = {"bottle": Frame([0.3, 0.0, 2.0])}
 
@@ -23,11 +23,8 @@ def learn_model():
     return bottle_model(3, tol=1e6).fit(few_bottles())
 
 
-def report(joints, frames, time=0.0, summarised=True):
-    model = small_bottle()
-    known = [model.summary_] if summarised else []
-    now = torch.as_tensor(time)
-    return check_situations(joints, frames, now, model.kinematics_, model.time_, known)
+def report(joints, frames):
+    return check_situations(small_bottle().skill, joints, frames, torch.tensor(0.0))
 
 
 def test_a_batch_names_the_most_unlike_robot():

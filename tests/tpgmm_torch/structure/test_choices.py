@@ -1,16 +1,15 @@
-"""Alignments by name."""
+"""Choices by name: alignments."""
 
 from typing import get_args
 
-import pytest
-
+from tests.support.refusals import refused
 from tpgmm_tools.arguments.options import Alignments
-from tpgmm_torch.alignment.text import METHODS, parse_alignment
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.structure.choices import ALIGNMENTS, aligner
 
 
 def test_names_stand_for_alignments():
-    assert {method: repr(parse_alignment(method)) for method in METHODS} == {
+    assert {name: repr(aligner(name)) for name in ALIGNMENTS if name != "parts"} == {
         "dtw": "DynamicTimeWarping()",
         "barycenter": "DynamicTimeWarping(reference='barycenter')",
         "linear": "LinearTimeNormalization()",
@@ -18,11 +17,9 @@ def test_names_stand_for_alignments():
         "events+dtw": "EventAlignment(within=DynamicTimeWarping())",
         "none": "None",
     }
-    assert parse_alignment("events+dtw", features=["speed"]).within.features == ["speed"]
-    with pytest.raises(DataError, match=r"one of \['dtw', .*got 'warp'"):
-        parse_alignment("warp")
+    assert aligner("events+dtw", features=["speed"]).within.features == ["speed"]
+    refused(lambda: aligner("warp"), DataError, r"one of \['dtw', .*got 'warp'")
 
 
 def test_the_command_line_has_them_all():
-    """And the one that first finds where to anchor."""
-    assert set(get_args(Alignments)) == {*METHODS, "parts"}
+    assert set(get_args(Alignments)) == {*ALIGNMENTS}
