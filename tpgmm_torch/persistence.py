@@ -59,8 +59,8 @@ KNOWN: dict[str, type] = {
     each.__name__: each
     for each in (
         *(each for each in OPERATORS if issubclass(each, Operator)),
-        Robot, Poses, JointSpace, Hold, TrainingSummary, MotionBounds, CommandGaps, Conditionals,
-        Regression, InformationFusion, CovarianceFusion, ViaPoint, ViaPoints, Sequence, Ways,
+        Robot, Poses, JointSpace, Hold, TrainingSummary, MotionBounds, CommandGaps,
+        Conditionals, Regression, InformationFusion, CovarianceFusion, ViaPoint, ViaPoints, Sequence, Ways,
         TaskParameterizedGMM,
     )
 }  # fmt: skip
@@ -428,9 +428,9 @@ def _numbers(skill: Regression) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]
         yield f"peaks.{number}", peak, (robot.n_joints,)
     if skill.gaps is not None:
         instants = len(skill.gaps.time)
-        shapes = {"time": (instants,), "lag": (robot.n_joints,)}
+        of_gaps = {"time": (instants,), "lag": (robot.n_joints,)}
         for name, value in vars(skill.gaps).items():
-            yield f"gaps.{name}", value, shapes.get(name, (instants, robot.n_joints))
+            yield f"gaps.{name}", value, of_gaps.get(name, (instants, robot.n_joints))
     if skill.motion_bounds is not None:
         yield "motion_bounds", torch.zeros_like(skill.motion_bounds.lower), (robot.n_joints,)
     for j, (one, operator) in enumerate(zip(skill.conditionals, skill.operators, strict=True)):
