@@ -60,8 +60,8 @@ KNOWN: dict[str, type] = {
     for each in (
         *(each for each in OPERATORS if issubclass(each, Operator)),
         Robot, Poses, JointSpace, Hold, TrainingSummary, MotionBounds, CommandGaps,
-        Conditionals, Regression, InformationFusion, CovarianceFusion, ViaPoint, ViaPoints, Sequence, Ways,
-        TaskParameterizedGMM,
+        Conditionals, Regression, InformationFusion, CovarianceFusion, ViaPoint, ViaPoints,
+        Sequence, Ways, TaskParameterizedGMM,
     )
 }  # fmt: skip
 #: What an estimator has learned, as :meth:`TaskParameterizedGMM.from_parameters` takes it.
