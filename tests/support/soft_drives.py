@@ -20,6 +20,7 @@ from tpgmm_torch import (
     Robot,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 LENGTHS, AXES = (0.0, 0.3, 0.3, 0.15), ("0 0 1", "0 0 1", "0 0 1", "1 0 0")
@@ -42,7 +43,7 @@ def arm() -> Robot:
     return Robot.from_urdf(f'<robot name="arm">{bodies}{"".join(joints)}</robot>', ["hand"])
 
 
-def moves(time: np.ndarray, begin: float, end: float) -> np.ndarray:
+def moves(time: Array, begin: float, end: float) -> Array:
     """Return a share (T, 1) that rises smoothly from ``begin`` to ``end``."""
     share = torch.from_numpy(np.clip((time - begin) / (end - begin), 0, 1))
     return minimum_jerk(share).numpy()[:, None]
@@ -51,7 +52,8 @@ def moves(time: np.ndarray, begin: float, end: float) -> np.ndarray:
 @cache
 def demonstrations(holds: bool = False, sag: float | None = None) -> list[Demonstration]:
     """Show how a cup is reached and carried away; with ``sag`` [rad], with commands, too."""
-    generator, time, shown = np.random.default_rng(3), np.linspace(0, END, 126), []
+    generator, shown = np.random.default_rng(3), []
+    time: Any = np.linspace(0, END, 126)
     for _ in range(6):
         start, there = np.array([[0.3, 0.8, -0.4, 0.0], [0.1, 0.5, -0.3, 0.0]]) + (
             0.1 * generator.standard_normal((2, 4))
@@ -125,10 +127,14 @@ class Drives:
 
 
 def begin(
-    holds: bool = False, sag: float | None = None, sag_of_drives: float = 0.0, **drives: Any
+    holds: bool = False,
+    sag: float | None = None,
+    sag_of_drives: float = 0.0,
+    clock: str = "localizing",
+    **drives: Any,
 ) -> Drives:
     """Begin the skill where the first demonstration did."""
     shown = demonstrations(holds, sag)[0]
     frames = {"cup": Frame(shown.frames["cup"].position[0])}
-    controller = Controller(learned(holds, sag).skill, shown.joints[0], frames)
+    controller = Controller(learned(holds, sag).skill, shown.joints[0], frames, clock=clock)
     return Drives(controller, sag=sag_of_drives, **drives)

@@ -34,12 +34,15 @@ class Clock:
     arrivals : tuple of float, default=()
         Times in the skill that are not passed before each joint has come to its reference [s]:
         for a gripper to close when the hand is there, not when it is time.
+    wait_limit : float, default=inf
+        How long a robot is waited for before it stops for good, with the status ``"stopped"``
+        [s].
 
     Raises
     ------
     DataError
-        If there is no such kind or beginning, the speed is not positive, or an arrival no
-        number.
+        If there is no such kind or beginning, the speed or the limit is not positive, or an
+        arrival no number.
 
     Examples
     --------
@@ -53,6 +56,7 @@ class Clock:
     speed: float = 1.0
     initial: str = "beginning"
     arrivals: tuple[float, ...] = ()
+    wait_limit: float = math.inf
 
     def __post_init__(self) -> None:
         for name, choices in (("kind", KINDS), ("initial", INITIAL)):
@@ -61,15 +65,17 @@ class Clock:
                     f"{name} of a clock is one of {list(choices)}, got {getattr(self, name)!r}"
                 )
         try:
-            speed, *arrivals = map(float, (self.speed, *self.arrivals))
+            speed, limit, *arrivals = map(float, (self.speed, self.wait_limit, *self.arrivals))
         except (TypeError, ValueError):
-            speed, arrivals = math.nan, []
-        if not 0 < speed < math.inf or not all(map(math.isfinite, arrivals)):
+            speed, limit, arrivals = math.nan, math.nan, []
+        if not (0 < speed < math.inf and limit > 0 and all(map(math.isfinite, arrivals))):
             raise DataError(
-                "a clock has a positive speed, and arrivals in seconds, got "
-                f"speed={self.speed!r}, arrivals={self.arrivals!r}"
+                "a clock has a positive speed, a positive wait_limit and arrivals in seconds, "
+                f"got speed={self.speed!r}, wait_limit={self.wait_limit!r}, "
+                f"arrivals={self.arrivals!r}"
             )
         object.__setattr__(self, "speed", speed)
+        object.__setattr__(self, "wait_limit", limit)
         object.__setattr__(self, "arrivals", tuple(sorted(arrivals)))
 
     @classmethod
@@ -95,7 +101,7 @@ class Clock:
             if name in settings or name not in {field.name for field in fields(cls)}:
                 raise DataError(
                     f"clock {text!r}: {name!r} is no option or given twice; there are speed, "
-                    "initial and arrivals, each written as NAME=VALUE"
+                    "initial, arrivals and wait_limit, each written as NAME=VALUE"
                 )
             settings[name] = value.split("/") if name == "arrivals" else value
         return cls(**settings)

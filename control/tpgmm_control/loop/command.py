@@ -17,6 +17,7 @@ from torch import Tensor
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_control.loop.gates import Gates
 from tpgmm_control.loop.locate import HELD, Progress
+from tpgmm_control.loop.patience import Patience
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.servo import Flags
 from tpgmm_torch.data.arrays import Array
@@ -34,6 +35,7 @@ class Status(StrEnum):
     DISPLACED = "displaced"  #: somebody else has moved it
     HOLDING = "holding"  #: it stands: inputs cannot be trusted, or it has tried in vain
     FINISHED = "finished"  #: it stands at the end of the skill
+    STOPPED = "stopped"  #: it was waited for as long as the clock allows, and stands for good
 
     @property
     def code(self) -> int:
@@ -223,6 +225,7 @@ def statuses(
     inputs: Inputs | None,
     gates: Gates | None = None,
     obstructed: Mapping[int, tuple[bool, str]] = MappingProxyType({}),
+    patience: Patience | None = None,
 ) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
     """The status of each robot, and why one does not simply run.
 
@@ -247,6 +250,8 @@ def statuses(
         What robots wait for at the end of a skill.
     obstructed : mapping of int to (bool, str)
         Robots that obstacles keep off: whether time waits for them, and why.
+    patience : Patience, optional
+        Robots that are waited for no longer.
     """
     codes, texts = _at_gates(progress, gates)
     if progress.waits.any():
@@ -265,12 +270,16 @@ def statuses(
         if robots is not None:
             codes[robots] = Status.HOLDING.code
             texts |= dict.fromkeys(np.flatnonzero(robots).tolist(), reason)
+    if patience is not None:
+        texts = patience.announce(texts)
     indices = list(np.ndindex(*batch)) if texts else []
     reasons = {indices[row]: text for row, text in texts.items()}
     if halted is not None and inputs is not None:
         codes[halted] = Status.HOLDING.code
         found = inputs.reasons(halted.reshape(tuple(batch))).items()
         reasons |= {index: text for index, text in found if text or index not in reasons}
+    if patience is not None:
+        codes[patience.stands] = Status.STOPPED.code
     return codes, reasons
 
 

@@ -56,12 +56,13 @@ from tpgmm_control.contact.admittance import Admittance, Offsets
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_control.loop import command as commands
 from tpgmm_control.loop.clock import Clock
-from tpgmm_control.loop.command import Command
+from tpgmm_control.loop.command import Command, Status
 from tpgmm_control.loop.estimate import choose, estimate
 from tpgmm_control.loop.gates import Gates, Moment
 from tpgmm_control.loop.gripping import gripping_joints
 from tpgmm_control.loop.hold import Holds
 from tpgmm_control.loop.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
+from tpgmm_control.loop.patience import Patience
 from tpgmm_control.loop.places import Places
 from tpgmm_control.loop.reach import Fade, nearest
 from tpgmm_control.motion.follow import Following
@@ -249,6 +250,9 @@ class Controller:
 
     def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
         self._places, rows = Places(self._skill, begin, end), _rows(as_array(start))
+        self._patience = None
+        if clock.wait_limit < math.inf:
+            self._patience = Patience(clock.wait_limit, np.zeros(len(rows)))
         time = np.full(len(rows), begin, np.float64)
         self._gates = Gates.start(self._skill.gates, time, end, self._trusts)
         if clock.kind == "localizing" and clock.initial == "anywhere":
@@ -369,7 +373,10 @@ class Controller:
             self._hold(tick, frames, holds)
             self._touch(tick)
         self._move(tick)
-        return self._send(tick)
+        command = self._send(tick)
+        if self._patience is not None:
+            self._wait(tick, command)
+        return command
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
@@ -437,10 +444,12 @@ class Controller:
             self._inputs = self._inputs.update(tick.seconds, joints, frames, ages)
             self._accept_places()
             self._frames, measured = self._inputs.frames, self._inputs.measured
-            halted = self._inputs.untrusted(self._holds.known(self.reference))
-            halted = (
-                halted.reshape(-1) if tick.paused is None else halted.reshape(-1) | tick.paused
-            )
+            untrusted = self._inputs.untrusted(self._holds.known(self.reference))
+            halted: Flags = untrusted.reshape(-1)
+            if tick.paused is not None:
+                halted = halted | tick.paused
+            if self._patience is not None:
+                halted = halted | self._patience.stands
             tick.halted = halted if halted.any() else None
         if measured is not None and self._gripping is not None:
             # the objects that they hold keep gripping joints from their references
@@ -521,6 +530,17 @@ class Controller:
                 self._gaps = self._gaps.restart(self._tensor(robots))
             if self._search is not None:
                 self._search = self._search.drop_robots(self._tensor(robots))
+
+    def _wait(self, tick: _Tick, command: Command) -> None:
+        """Count for how long robots are waited for."""
+        assert self._patience is not None
+        waits = command.of(Status.WAITING) | command.of(Status.DISPLACED)
+        passed = np.zeros(len(self._progress.time)) + np.ravel(tick.seconds)
+        indices = list(np.ndindex(*self.reference.shape[:-1]))
+        why = {row: command.reason(index) for row, index in enumerate(indices)}
+        why = {row: text.partition("; stops for good")[0] for row, text in why.items()}
+        flags = waits.numpy(force=True).reshape(-1)
+        self._patience = self._patience.advance(flags, passed, why)
 
     def _find(self, row: int, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""
@@ -701,7 +721,7 @@ class Controller:
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
             ((lost, NO_ANSWER), (tick.late, NOT_INCREASED), (tick.paused, PAUSED)),
-            tick.halted, self._inputs, self._gates, blocked,
+            tick.halted, self._inputs, self._gates, blocked, self._patience,
         )  # fmt: skip
         self.command = Command(
             self._sent.reference,

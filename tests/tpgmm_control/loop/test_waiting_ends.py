@@ -11,6 +11,7 @@ from tests.support.soft_drives import GRASP, begin, learned
 from tpgmm_control import Controller
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.regression.posture import PostureSearch
 
 
 @pytest.mark.parametrize("noise", [0.0005, 0.004, 0.015])
@@ -22,6 +23,23 @@ def test_a_stop_ends_whatever_the_noise(holds, noise):
         run.tick(stopped=3.2 <= now < 4.7)
         assert now < 9
     assert run.statuses["waiting"] * 0.02 == pytest.approx(1.5, abs=0.4)
+
+
+def test_a_robot_that_nobody_frees_stops_for_good():
+    run = begin(clock="localizing:wait_limit=2")
+    for _ in range(100):
+        run.tick()
+    reasons, reference = [], None
+    for k in range(300):
+        command = run.tick(stopped=k < 200)
+        reasons.append(command.reason())
+        if str(command.status) == "stopped":
+            reference = run.reference if reference is None else reference
+            assert np.abs(run.reference - reference).max() < 0.02
+    assert run.statuses["waiting"] * 0.02 == pytest.approx(2, abs=0.1)
+    assert str(command.status) == "stopped"
+    assert any("stops for good in 1.0 s" in reason for reason in reasons)
+    assert "stopped for good after 2 s: joint" in command.reason()
 
 
 @pytest.mark.parametrize("size", [0.03, 0.06, 0.1])
@@ -83,8 +101,10 @@ def test_a_robot_that_is_elsewhere_at_the_end_has_not_finished(push):
     assert str(command.status) == "finished"
 
 
-def test_the_bounds_of_acceleration_alone_begin_no_search():
+def test_the_bounds_of_acceleration_alone_begin_no_search(monkeypatch):
     shown = learned()
+    searches = []
+    monkeypatch.setattr(PostureSearch, "advance", lambda *given: searches.append(given))
     tight = {"acceleration": 1.0, "jerk": 8.0}
     run = begin()
     frames = run.controller.holding.frames
@@ -95,7 +115,11 @@ def test_the_bounds_of_acceleration_alone_begin_no_search():
             one.step(0.04, one.reference)
     for _ in range(100):
         controller.step(0.04, controller.reference)
-    assert float((controller.reference - goal.reference).abs().max()) < 1e-3
+    there, wanted = (
+        shown.kinematics_.state(one.reference).position("hand") for one in (controller, goal)
+    )
+    assert float((there - wanted).norm()) < 2e-3
+    assert not searches
 
 
 def test_what_runs_can_be_copied():
