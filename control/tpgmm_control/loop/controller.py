@@ -714,9 +714,9 @@ class Controller:
         following, progress = self._following, self._progress
         lost = None if following.lost is None else following.lost.numpy(force=True).reshape(-1)
         ended = None if tick.ended is None else tick.ended.numpy(force=True).reshape(-1)
-        blocked: Mapping[int, tuple[bool, str]] = {}
+        blocked: Mapping[int, tuple[bool, str]] = self._behind()
         if tick.obstructed is not None and self._avoidance is not None:
-            blocked = self._avoidance.reasons(tick.obstructed)
+            blocked = {**blocked, **self._avoidance.reasons(tick.obstructed)}
         codes, reasons = commands.statuses(
             self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
             following.wanted, ended,
@@ -736,6 +736,20 @@ class Controller:
             self._tensor(progress.servo.offset),
         )
         return self.command
+
+    def _behind(self) -> dict[int, tuple[bool, str]]:
+        """Say which references are behind what the skill wants, as fast as they may."""
+        following = self._following
+        if following.follower is None or not np.any(following.follower.moment.behind):
+            return {}
+        gap = _rows(as_array(following.wanted.detach() - following.reference.detach()))
+        late = np.abs(gap) / as_array(following.follower.bounds.velocity)
+        names, found = self._skill.kinematics.joint_names, {}
+        for row in np.flatnonzero(late.max(-1) > LATE).tolist():
+            joint = int(late[row].argmax())
+            said = f"joint {names[joint]!r} is {gap[row, joint]:+.2f} from what the skill wants"
+            found[row] = (False, f"{said}, as fast as its bounds allow")
+        return found
 
     # Conversions
 
@@ -796,6 +810,8 @@ class Controller:
         return functools.partial(_novelty, summary, self._start, first, now)
 
 
+#: A reference that is later than this behind what is wanted, at full speed, is said to be [s].
+LATE = 0.2
 #: A loop that stood for longer holds robots for a tick [s].
 PAUSE = 1.0
 #: Why a robot is held.

@@ -122,6 +122,17 @@ def test_the_bounds_of_acceleration_alone_begin_no_search(monkeypatch):
     assert not searches
 
 
+def test_a_reference_that_cannot_keep_up_is_said_to_be_behind():
+    run = begin()
+    frames, start = run.controller.holding.frames, run.reference + 1.2 * np.eye(4)[1]
+    slow = {"velocity": 0.3}
+    with pytest.warns(PlausibilityWarning, match="start posture"):
+        controller = Controller(learned().skill, start, frames, bounds=slow, blend=0.2)
+    said = {controller.step(0.02, controller.reference).reason() for _ in range(40)}
+    assert any("from what the skill wants, as fast as its bounds allow" in one for one in said)
+    assert not any(run.tick().reason() for _ in range(40))
+
+
 def test_what_runs_can_be_copied():
     time = np.linspace(0, 1, 40)
     joints = np.stack((np.sin(time), time), 1)
