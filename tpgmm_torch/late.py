@@ -22,7 +22,8 @@ def load_late(
 
     Returns
     -------
-    __getattr__, __dir__ : callable
+    tuple of two callable
+        ``__getattr__`` and ``__dir__``.
 
     Examples
     --------

@@ -98,7 +98,7 @@ CEILINGS: dict[str, Ceiling] = {
     "lines of lerobot_env_bimanual": Ceiling(5313, "0.4.0"),
     "lines of tpgmm_evaluation": Ceiling(4697, "0.4.0"),
     "lines of benchmarks": Ceiling(1556, "0.4.0"),
-    "lines of tests": Ceiling(34340, "0.4.0"),
+    "lines of tests": Ceiling(34344, "0.4.0"),
     # the loop will be rewritten for one robot
     "complex functions of run": Ceiling(6, "0.4.0"),
     "participles of run": Ceiling(56, "0.4.0"),

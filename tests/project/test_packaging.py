@@ -33,7 +33,7 @@ DISTRIBUTIONS = {
     "lerobot_env_bimanual": (ROOT / "environments", ("lerobot_env_bimanual",)),
     "tpgmm_evaluation": (ROOT / "evaluation", ("tpgmm_evaluation",)),
 }
-SHIPPED = {".css", ".jinja", ".js", ".py", ".typed", ".urdf", ".xml"}
+SHIPPED = {".css", ".html", ".jinja", ".js", ".py", ".typed", ".urdf", ".xml"}
 PROJECTS = {
     name: tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for name, (folder, _) in DISTRIBUTIONS.items()

@@ -55,11 +55,11 @@ class Motion:
 
         Raises
         ------
-        ShapeError
+        ShapeError, UnknownNameError
             If it has not the robot's joints.
         """
-        n, names = kinematics.n_joints, demonstration.joint_names
-        if demonstration.n_joints != n and (names is None or demonstration.n_joints < n):
+        n = kinematics.n_joints
+        if demonstration.joint_names is None and demonstration.n_joints != n:
             raise ShapeError(
                 f"a demonstration has {demonstration.n_joints} joints, the robot has {n}: "
                 f"{kinematics.joint_names}"

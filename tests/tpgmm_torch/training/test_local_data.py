@@ -7,7 +7,7 @@ import torch
 from tests.support.local_coordinates import local_coordinates
 from tests.support.motions import turning
 from tpgmm_torch import AbsoluteOrientation, AbsolutePosition, Canonical, Demonstration, Stack
-from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.training.local_data import constant_columns, like, local_data
@@ -115,9 +115,13 @@ def test_rounding_is_measured_by_the_largest_coordinate_of_the_operator():
 
 def test_a_demonstration_without_the_joints_of_the_robot_is_named():
     motion = turning(TIME, TIME / 2)
-    for names, width in ((None, 6), (None, 8), (HAND.joint_names[:6], 6)):
+    for names, width, error, text in (
+        (None, 6, ShapeError, "a demonstration has 6 joints, .* has 7"),
+        (None, 8, ShapeError, "a demonstration has 8 joints, .* has 7"),
+        (HAND.joint_names[:6], 6, UnknownNameError, "joint 'hand.qz' is not in the demonstr"),
+    ):
         wrong = Demonstration(TIME, np.ones((40, width)), None, names)
-        with pytest.raises(ShapeError, match=f"a demonstration has {width} joints, .* has 7"):
+        with pytest.raises(error, match=text):
             local_data([motion, wrong], OPERATORS, HAND)
     # further columns may stand beside those of the robot if their names say which are which
     wider = Demonstration(
