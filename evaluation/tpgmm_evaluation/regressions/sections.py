@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -199,7 +200,8 @@ def mistakes(plan: Plan) -> Iterator[tuple[str, Work]]:
         return any(re.search(mistake.told, message) for message in messages)
 
     def work() -> Measured:
-        chosen = table[::8] if plan.small else table
+        # by name, so that the sample stays the same whatever is added to the table
+        chosen = [x for x in table if not plan.small or crc32(str(x).encode()) % 8 == 0]
         return {f"success:{m}": np.array([float(is_noticed(m))]) for m in chosen}
 
     yield "table", work

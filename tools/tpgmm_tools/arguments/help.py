@@ -63,6 +63,7 @@ def _panels(params: Iterable[Any], ctx: Any, every: bool) -> dict[str, list[tupl
 def _record(one: Any, ctx: Any) -> tuple[str, str]:
     """Return how a parameter is typed, and its text; of an argument without its type."""
     syntax, text = one.get_help_record(ctx)
+    text = text.replace("\\[", "[")  # as typer 0.19 writes them, for rich
     return one.metavar if one.param_type_name == "argument" else syntax, text
 
 
