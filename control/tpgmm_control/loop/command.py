@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_control.loop.gates import Gates
-from tpgmm_control.loop.locate import HELD, Progress
+from tpgmm_control.loop.locate import Mode, Progress
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.servo import Flags
 from tpgmm_torch.data.arrays import Array
@@ -215,7 +215,7 @@ def refused(last: Command, reason: str) -> Command:
 def statuses(
     batch: Sequence[int],
     names: Sequence[str],
-    progress: Progress,
+    progress: Sequence[Progress],
     wanted: Tensor,
     ended: Flags | None,
     held: Sequence[tuple[Flags | None, str]],
@@ -232,7 +232,8 @@ def statuses(
         Shape of the batch; robots are (B,) in what follows.
     names : sequence of str
         Of the joints.
-    progress : Progress
+    progress : sequence of Progress
+        Of each robot.
     wanted : Tensor of shape (..., n_joints)
         Where robots should be.
     ended : bool array of shape (B,), optional
@@ -248,17 +249,19 @@ def statuses(
     obstructed : mapping of int to (bool, str)
         Robots that obstacles keep off: whether time waits for them, and why.
     """
-    codes, texts = _at_gates(progress, gates)
-    if progress.waits.any():
-        texts |= _waiting(progress, names, wanted, inputs)
-        codes[progress.waits] = Status.WAITING.code
-        codes[progress.waits & progress.displaced] = Status.DISPLACED.code
+    codes, texts = _at_gates(len(progress), gates)
+    rows = [row for row, robot in enumerate(progress) if robot.waits]
+    if rows:
+        texts |= _waiting(progress, rows, names, wanted, inputs)
+    for row in rows:
+        displaced = progress[row].probe.displaced
+        codes[row] = (Status.DISPLACED if displaced else Status.WAITING).code
     if ended is not None:  # with joints that are somewhere else, a robot has not finished
-        off = ended & progress.lasting
-        codes[ended & ~off] = Status.FINISHED.code
+        codes[ended] = Status.FINISHED.code
+        off = [row for row in np.flatnonzero(ended).tolist() if progress[row].lasting]
         codes[off] = Status.WAITING.code
-        rows = wanted.numpy(force=True).reshape(len(off), -1)
-        texts |= {row: _gap(progress, row, names, rows) for row in np.flatnonzero(off).tolist()}
+        to = wanted.numpy(force=True).reshape(len(progress), -1)
+        texts |= {row: _gap(progress[row], names, to[row]) for row in off}
     for row, (waits, reason) in obstructed.items():
         codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
     for robots, reason in held:
@@ -274,11 +277,9 @@ def statuses(
     return codes, reasons
 
 
-def _at_gates(
-    progress: Progress, gates: Gates | None
-) -> tuple[NDArray[np.int8], dict[int, str]]:
+def _at_gates(count: int, gates: Gates | None) -> tuple[NDArray[np.int8], dict[int, str]]:
     """The status of robots whose skill has to be followed by another, and why they stand."""
-    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    codes, texts = np.zeros(count, np.int8), dict[int, str]()
     if gates is not None and gates.reasons:
         texts |= gates.reasons
         codes[list(texts)] = Status.WAITING.code
@@ -287,24 +288,25 @@ def _at_gates(
 
 
 def _waiting(
-    progress: Progress, names: Sequence[str], wanted: Tensor, inputs: Inputs | None
+    progress: Sequence[Progress],
+    rows: Sequence[int],
+    names: Sequence[str],
+    wanted: Tensor,
+    inputs: Inputs | None,
 ) -> dict[int, str]:
-    """For which joint each robot is waited."""
-    to = wanted.numpy(force=True).reshape(len(progress.time), -1)
-    rows = np.flatnonzero(progress.waits).tolist()
-    texts = {row: _gap(progress, row, names, to) for row in rows}
+    """For which joint each of some robots is waited."""
+    to = wanted.numpy(force=True).reshape(len(progress), -1)
+    texts = {row: _gap(progress[row], names, to[row]) for row in rows}
     if inputs is not None:
-        frozen = np.flatnonzero(progress.waits & inputs.frozen.reshape(-1)).tolist()
-        texts |= {row: f"{texts[row]}; {FROZEN}" for row in frozen}
+        frozen = inputs.frozen.reshape(-1)
+        texts |= {row: f"{texts[row]}; {FROZEN}" for row in rows if frozen[row]}
     return texts
 
 
-def _gap(progress: Progress, row: int, names: Sequence[str], wanted: Array) -> str:
+def _gap(progress: Progress, names: Sequence[str], wanted: Array) -> str:
     """For which joint a robot is waited, and how far it is off."""
     servo = progress.servo
-    gap = servo.gap[row]
-    if progress.mode[row] == HELD:
-        gap = servo.corrected[row] - wanted[row]
+    gap = servo.corrected - wanted if progress.mode is Mode.HELD else servo.gaps.mean
     joint = int(np.abs(gap).argmax())
-    offset = servo.offset[row, joint]
+    offset = servo.offset.mean[joint]
     return f"joint {names[joint]!r} is {gap[joint]:+.3f} off, beside an offset of {offset:+.3f}"
