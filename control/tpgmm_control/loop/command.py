@@ -249,10 +249,35 @@ def statuses(
     obstructed : mapping of int to (bool, str)
         Robots that obstacles keep off: whether time waits for them, and why.
     """
-    codes, texts = _at_gates(len(progress), gates)
+    codes, texts = _find_statuses(progress, names, wanted, ended, inputs, gates)
+    for row, (waits, reason) in obstructed.items():
+        codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
+    for robots, reason in held:
+        rows = [] if robots is None else np.flatnonzero(robots).tolist()
+        codes[rows] = Status.HOLDING.code
+        texts |= dict.fromkeys(rows, reason)
+    indices = list(np.ndindex(*batch)) if texts else []
+    reasons = {indices[row]: text for row, text in texts.items()}
+    if halted is not None and inputs is not None:
+        codes[halted] = Status.HOLDING.code
+        found = inputs.reasons(halted.reshape(tuple(batch)))
+        reasons |= {index: text or reasons.get(index, "") for index, text in found.items()}
+    return codes, reasons
+
+
+def _find_statuses(
+    progress: Sequence[Progress],
+    names: Sequence[str],
+    wanted: Tensor,
+    ended: Flags | None,
+    inputs: Inputs | None,
+    gates: Gates | None,
+) -> tuple[NDArray[np.int8], dict[int, str]]:
+    """Find how far robots follow, as far as their joints tell it, and why they do not."""
+    codes, texts = _find_waits_at_gates(len(progress), gates)
     rows = [row for row, robot in enumerate(progress) if robot.waits]
     if rows:
-        texts |= _waiting(progress, rows, names, wanted, inputs)
+        texts |= _explain_waiting(progress, rows, names, wanted, inputs)
     for row in rows:
         displaced = progress[row].probe.displaced
         codes[row] = (Status.DISPLACED if displaced else Status.WAITING).code
@@ -261,24 +286,14 @@ def statuses(
         off = [row for row in np.flatnonzero(ended).tolist() if progress[row].lasting]
         codes[off] = Status.WAITING.code
         to = wanted.numpy(force=True).reshape(len(progress), -1)
-        texts |= {row: _gap(progress[row], names, to[row]) for row in off}
-    for row, (waits, reason) in obstructed.items():
-        codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
-    for robots, reason in held:
-        if robots is not None:
-            codes[robots] = Status.HOLDING.code
-            texts |= dict.fromkeys(np.flatnonzero(robots).tolist(), reason)
-    indices = list(np.ndindex(*batch)) if texts else []
-    reasons = {indices[row]: text for row, text in texts.items()}
-    if halted is not None and inputs is not None:
-        codes[halted] = Status.HOLDING.code
-        found = inputs.reasons(halted.reshape(tuple(batch))).items()
-        reasons |= {index: text for index, text in found if text or index not in reasons}
-    return codes, reasons
+        texts |= {row: _describe_gap(progress[row], names, to[row]) for row in off}
+    return codes, texts
 
 
-def _at_gates(count: int, gates: Gates | None) -> tuple[NDArray[np.int8], dict[int, str]]:
-    """The status of robots whose skill has to be followed by another, and why they stand."""
+def _find_waits_at_gates(
+    count: int, gates: Gates | None
+) -> tuple[NDArray[np.int8], dict[int, str]]:
+    """Find which robots stand at the end of a skill before another, and why."""
     codes, texts = np.zeros(count, np.int8), dict[int, str]()
     if gates is not None and gates.reasons:
         texts |= gates.reasons
@@ -287,24 +302,24 @@ def _at_gates(count: int, gates: Gates | None) -> tuple[NDArray[np.int8], dict[i
     return codes, texts
 
 
-def _waiting(
+def _explain_waiting(
     progress: Sequence[Progress],
     rows: Sequence[int],
     names: Sequence[str],
     wanted: Tensor,
     inputs: Inputs | None,
 ) -> dict[int, str]:
-    """For which joint each of some robots is waited."""
+    """Tell for which joint each of some robots is waited."""
     to = wanted.numpy(force=True).reshape(len(progress), -1)
-    texts = {row: _gap(progress[row], names, to[row]) for row in rows}
+    texts = {row: _describe_gap(progress[row], names, to[row]) for row in rows}
     if inputs is not None:
         frozen = inputs.frozen.reshape(-1)
         texts |= {row: f"{texts[row]}; {FROZEN}" for row in rows if frozen[row]}
     return texts
 
 
-def _gap(progress: Progress, names: Sequence[str], wanted: Array) -> str:
-    """For which joint a robot is waited, and how far it is off."""
+def _describe_gap(progress: Progress, names: Sequence[str], wanted: Array) -> str:
+    """Tell for which joint a robot is waited, and how far it is off."""
     servo = progress.servo
     gap = servo.corrected - wanted if progress.mode is Mode.HELD else servo.gaps.mean
     joint = int(np.abs(gap).argmax())

@@ -512,7 +512,7 @@ class Controller:
     def _advance_progress(
         self, tick: _Tick, passed: Array, still: Flags, obstructed: Array
     ) -> None:
-        """Progress of robots (B,) by what is measured."""
+        """Let robots (B,) make progress by what is measured."""
         reference, running = _rows(as_array(self._wanted_posture)), self._running
         joints = reference * np.nan if tick.joints is None else _rows(as_array(tick.joints))
         jumped: Flags = np.zeros(len(passed), bool)

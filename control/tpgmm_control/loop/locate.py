@@ -371,19 +371,25 @@ class Progress:
         known, judgement, timing = seen.known, self.servo.judgement, self.timing
         excess = float(judgement.excess[known].max(initial=0.0))
         lead = max(float(judgement.lead[known].max(initial=0.0)), seen.obstructed)
-        stands, rate = seen.halted or self.mode is not Mode.RUNNING, 1.0
-        if self.clock.kind != "even":
-            rate = min(max(2 - 2 * max(excess, lead), 0.0), 1.0)
-            rate = min(rate, timing.rate + seen.dt / RESTART)
+        stands = seen.halted or self.mode is not Mode.RUNNING
+        rate = self._compute_rate(max(excess, lead), seen.dt)
         step = timing.advance(seen.dt, seen.halted, stands, rate)
         step = 0.0 if stands else self.clock.speed * rate * step
         self.time = self._stop_at_arrival(self._limit_time(step), known)
-        left = self._leave_rest(known)
-        stalled = self.clock.kind != "even" and not stands and not left and self._stalls(known)
-        off = (not stands and excess > OFF) or stalled
+        left = self.mode is Mode.RUNNING and self._leave_rest(known)
+        if stands:
+            timing.off = 0.0
+            return
+        off = excess > OFF or (not left and self._stalls(known))
         timing.off = timing.off + seen.dt if off else 0.0
-        if excess < 0.5 and not stands:
+        if excess < 0.5:
             self.followed = Comparison(self.servo.expected, self.servo.readings.median)
+
+    def _compute_rate(self, gap: float, dt: float) -> float:
+        """Compute the rate of time by the largest gap, in units of what is usual."""
+        if self.clock.kind == "even":
+            return 1.0
+        return min(max(2 - 2 * gap, 0.0), 1.0, self.timing.rate + dt / RESTART)
 
     def _limit_time(self, step: float) -> float:
         """Compute the time after a step [s]; rounding does not cost a last one."""
@@ -402,10 +408,10 @@ class Progress:
         return arrivals[following] if late else time
 
     def _leave_rest(self, known: Flags) -> bool:
-        """Notice that a robot that runs has left where it was at rest."""
+        """Notice that the robot has left where it was at rest."""
         servo = self.servo
         moved = np.abs(servo.readings.median - self.rest.reading) > MOTION / 2 + 3 * servo.std
-        left = self.mode is Mode.RUNNING and bool(moved[known].any())
+        left = bool(moved[known].any())
         if left:
             self._rest_here(self.time)
         return left
@@ -417,6 +423,8 @@ class Progress:
 
     def _stalls(self, known: Flags) -> bool:
         """Tell whether joints were to move, however late they are, and none has."""
+        if self.clock.kind == "even":
+            return False
         asked = self.servo.measure_asked(self.rest.bank) - 6 * self.servo.std
         return bool((asked - 2 * self.servo.floor > 0)[known].any())
 
@@ -480,25 +488,30 @@ class Progress:
 
     def _end_probe(self, reference: Array, seen: Seen, find: Find, explained: bool) -> None:
         """End a probe that tells something."""
-        servo, probe, since = self.servo, self.probe, self.timing.in_mode
-        off, known = self._find_off(seen), seen.known
-        stuck, closed = known & probe.stuck, not off.any()
-        near = bool((np.abs(reference - probe.target)[stuck] < FLOOR / 10).all())
-        moved = np.abs(servo.corrected - probe.target) > MOTION + 3 * servo.std
-        came = closed and (explained or bool(moved[stuck].any()))
-        settled = closed or since > DWELL + 4 * _longest_lag(servo, off)
-        arrived = near and settled and not came
-        came = came or (closed and since > PROBE_TIME)
+        servo, probe, known = self.servo, self.probe, seen.known
         posture, resting, displaced = servo.corrected, servo.readings.resting, probe.displaced
+        came, arrived = self._judge_probe(reference, seen, explained)
         if came or (arrived and probe.placed):
             self._switch(Mode.RUNNING, probe.target)
-        if arrived and not probe.placed:
-            self._switch(Mode.HELD, np.where(known, posture, reference))
-            probe.held = resting
-            if self.comparison is not None:
-                self.comparison = replace(self.comparison, reading=resting)
-            if displaced and self._find_place(known, find):
-                self._switch(Mode.RUNNING, probe.target)
+        if not arrived or probe.placed:
+            return
+        self._switch(Mode.HELD, np.where(known, posture, reference))
+        probe.held = resting
+        if self.comparison is not None:
+            self.comparison = replace(self.comparison, reading=resting)
+        if displaced and self._find_place(known, find):
+            self._switch(Mode.RUNNING, probe.target)
+
+    def _judge_probe(self, reference: Array, seen: Seen, explained: bool) -> tuple[bool, bool]:
+        """Tell whether the robot came back, and whether its reference came to it instead."""
+        servo, probe, since = self.servo, self.probe, self.timing.in_mode
+        off, stuck = self._find_off(seen), seen.known & probe.stuck
+        near = bool((np.abs(reference - probe.target)[stuck] < FLOOR / 10).all())
+        if off.any():
+            return False, near and since > DWELL + 4 * _longest_lag(servo, off)
+        moved = np.abs(servo.corrected - probe.target) > MOTION + 3 * servo.std
+        came = explained or bool(moved[stuck].any())
+        return came or since > PROBE_TIME, near and not came
 
     def _release(self, seen: Seen) -> None:
         """Let a robot go on that was held, and moves again: what it missed is done then."""
