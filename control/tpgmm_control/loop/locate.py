@@ -148,7 +148,13 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Expected positions and readings (n_joints,) from when on motion is compared."""
+    """State of a robot that its later motion is compared with.
+
+    Parameters
+    ----------
+    expected, reading : array of shape (n_joints,)
+        Positions as they were expected, and as they were measured [rad or m].
+    """
 
     expected: Array
     reading: Array

@@ -124,7 +124,13 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """What readings exceed positions by (n_joints,) [rad or m], and the variance of that."""
+    """Sag, payload, slipped encoders: what readings exceed positions by.
+
+    Parameters
+    ----------
+    mean, variance : array of shape (n_joints,)
+        Estimate [rad or m], and its variance.
+    """
 
     mean: Array
     variance: Array
