@@ -256,13 +256,20 @@ def statuses(
         rows = [] if robots is None else np.flatnonzero(robots).tolist()
         codes[rows] = Status.HOLDING.code
         texts |= dict.fromkeys(rows, reason)
-    indices = list(np.ndindex(*batch)) if texts else []
-    reasons = {indices[row]: text for row, text in texts.items()}
+    reasons = _index_reasons(texts, batch)
     if halted is not None and inputs is not None:
         codes[halted] = Status.HOLDING.code
         found = inputs.reasons(halted.reshape(tuple(batch)))
         reasons |= {index: text or reasons.get(index, "") for index, text in found.items()}
     return codes, reasons
+
+
+def _index_reasons(
+    texts: Mapping[int, str], batch: Sequence[int]
+) -> dict[tuple[int, ...], str]:
+    """Give the reasons of robots by their index in a batch."""
+    indices = list(np.ndindex(*batch)) if texts else []
+    return {indices[row]: text for row, text in texts.items()}
 
 
 def _find_statuses(
@@ -295,10 +302,10 @@ def _find_waits_at_gates(
 ) -> tuple[NDArray[np.int8], dict[int, str]]:
     """Find which robots stand at the end of a skill before another, and why."""
     codes, texts = np.zeros(count, np.int8), dict[int, str]()
-    if gates is not None and gates.reasons:
-        texts |= gates.reasons
-        codes[list(texts)] = Status.WAITING.code
-        codes[gates.failed] = Status.HOLDING.code
+    for row, robot in enumerate(() if gates is None else gates.robots):
+        if robot.reason:
+            texts[row] = robot.reason
+            codes[row] = (Status.HOLDING if robot.failed else Status.WAITING).code
     return codes, texts
 
 

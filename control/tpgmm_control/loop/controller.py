@@ -250,9 +250,9 @@ class Controller:
     def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
         self._places, rows = Places(self._skill, begin, end), _rows(as_array(start))
         time = np.full(len(rows), begin, np.float64)
-        self._gates = Gates.start(self._skill.gates, time, end, self._trusts)
+        self._gates = Gates.start(self._skill.gates, time.tolist(), end, self._trusts)
         if clock.kind == "localizing" and clock.initial == "anywhere":
-            before = replace(self._places, end=min(end, float(self._gates.stop[0])))
+            before = replace(self._places, end=min(end, self._gates.find_span(0)[1]))
             for row in range(len(rows)):
                 time[row] = before.first(row, self.holding, start)
         self._clock, self._end = clock, end
@@ -554,39 +554,40 @@ class Controller:
 
     def _find(self, row: int, now: float, posture: Array) -> float | None:
         """A time of the skill that explains a robot's posture."""
-        gates = self._gates
-        if gates.failed[row]:
+        if self._gates.robots[row].failed:
             return None
-        within = float(gates.since[row]), float(gates.stop[row])
+        within = self._gates.find_span(row)
         like = self.reference.detach()
         return self._places.find(row, posture, now, self.holding, like, within)
 
     def _gate(self, tick: _Tick) -> None:
         """Robots that wait for the end of one skill to be what the next one needs."""
-        if tick.first or (self._gates.index == len(self._gates.gates)).all():
+        if tick.first or self._gates.over:
             return
         postures, passed = self._postures(tick, measured=True), self._passed(tick)
         ready = self._running & ~self._stands(tick)
         moment = None
-        if self._inputs is not None and np.isfinite(self._gates.stop).any():
+        if self._inputs is not None and any(stop is not None for stop in self._gates.stops):
             moment = self._moment(tick, postures)
         self._gates = gates = self._gates.advance(self._times, passed, ready, moment)
         self._limit_times()
-        for robot, time in zip(self._progress, gates.goto.tolist(), strict=True):
-            if math.isfinite(time):
-                robot.go_on_from(time)
-        begin, back = (self._tensor(each) for each in (gates.fade > 0, gates.returned))
+        for robot, passage in zip(self._progress, gates.robots, strict=True):
+            if passage.goto is not None:
+                robot.go_on_from(passage.goto)
+        fades = self._tensor(np.array([passage.fade for passage in gates.robots]))
+        returned = np.array([passage.goes_back for passage in gates.robots])
+        begin, back = fades > 0, self._tensor(returned)
         if begin.any():  # a skill begins with objects where they are now
             self._holds = self._holds.restarted(begin, postures)
-            self._fade = self._fade.again(begin, self._tensor(gates.fade))
+            self._fade = self._fade.again(begin, fades)
         if back.any():
             self._holds = self._holds.released(back, postures, self._frames)
-            self._resume(gates.returned)
+            self._resume(returned)
 
     def _limit_times(self) -> None:
         """Let robots go no further than their gates."""
-        for robot, stop in zip(self._progress, self._gates.stop.tolist(), strict=True):
-            robot.stop = stop if math.isfinite(stop) else None
+        for robot, stop in zip(self._progress, self._gates.stops, strict=True):
+            robot.stop = stop
 
     def _stands(self, tick: _Tick) -> Flags:
         """Robots (B,) without accepted inputs, or whose time did not increase."""
