@@ -494,7 +494,7 @@ class Controller:
         """Progress of each robot."""
         if tick.first:
             return
-        before, passed, still = self._times, self._passed(tick), self._stands(tick)
+        before, passed, still = self._times, self._measure_tick(tick), self._stands(tick)
         tick.obstructed = self._obstruction(passed)
         obstructed = np.zeros(len(before)) if tick.obstructed is None else tick.obstructed
         if not self._trusts and tick.joints is None:
@@ -521,16 +521,15 @@ class Controller:
             still = still | self._inputs.jumping.reshape(-1)
         columns = (each.tolist() for each in (passed, jumped, still, obstructed))
         for row, (dt, jumps, halted, much) in enumerate(zip(*columns, strict=True)):
-            robot, floor = self._progress[row], None
-            if self._gaps is not None:
-                floor = self._gaps.floor[row]
+            robot = self._progress[row]
+            floor = None if self._gaps is None else self._gaps.floor[row]
             seen = Seen(dt, joints[row], jumps, halted, much, floor)
             find = functools.partial(self._find, row, robot.time)
             robot.advance(reference[row], seen, find)
         self._resume(~running & self._running)
 
-    def _passed(self, tick: _Tick) -> Array:
-        """Duration of the tick for each robot (B,) [s]."""
+    def _measure_tick(self, tick: _Tick) -> Array:
+        """Compute the duration of the tick for each robot (B,) [s]."""
         return np.zeros(len(self._progress)) + np.ravel(tick.seconds)
 
     def _obstruction(self, passed: Array) -> Array | None:
@@ -553,7 +552,7 @@ class Controller:
                 self._search = self._search.drop_robots(self._tensor(robots))
 
     def _find(self, row: int, now: float, posture: Array) -> float | None:
-        """A time of the skill that explains a robot's posture."""
+        """Find a time of the skill that explains a robot's posture."""
         if self._gates.robots[row].failed:
             return None
         within = self._gates.find_span(row)
@@ -564,18 +563,23 @@ class Controller:
         """Robots that wait for the end of one skill to be what the next one needs."""
         if tick.first or self._gates.over:
             return
-        postures, passed = self._postures(tick, measured=True), self._passed(tick)
+        postures, passed = self._postures(tick, measured=True), self._measure_tick(tick)
         ready = self._running & ~self._stands(tick)
         moment = None
         if self._inputs is not None and any(stop is not None for stop in self._gates.stops):
             moment = self._moment(tick, postures)
-        self._gates = gates = self._gates.advance(self._times, passed, ready, moment)
+        self._gates = self._gates.advance(self._times, passed, ready, moment)
         self._limit_times()
-        for robot, passage in zip(self._progress, gates.robots, strict=True):
+        self._pass_gates(postures)
+
+    def _pass_gates(self, postures: Tensor) -> None:
+        """Go on from other times at postures (..., n_joints)."""
+        passages = self._gates.robots
+        for robot, passage in zip(self._progress, passages, strict=True):
             if passage.goto is not None:
                 robot.go_on_from(passage.goto)
-        fades = self._tensor(np.array([passage.fade for passage in gates.robots]))
-        returned = np.array([passage.goes_back for passage in gates.robots])
+        fades = self._tensor(np.array([passage.fade for passage in passages]))
+        returned = np.array([passage.goes_back for passage in passages])
         begin, back = fades > 0, self._tensor(returned)
         if begin.any():  # a skill begins with objects where they are now
             self._holds = self._holds.restarted(begin, postures)
