@@ -328,7 +328,7 @@ def _explain_waiting(
 def _describe_gap(progress: Progress, names: Sequence[str], wanted: Array) -> str:
     """Tell for which joint a robot is waited, and how far it is off."""
     servo = progress.servo
-    gap = servo.corrected - wanted if progress.mode is Mode.HELD else servo.gaps.mean
+    gap = servo.position - wanted if progress.mode is Mode.HELD else servo.gaps.mean
     joint = int(np.abs(gap).argmax())
     offset = servo.offset.mean[joint]
     return f"joint {names[joint]!r} is {gap[joint]:+.3f} off, beside an offset of {offset:+.3f}"

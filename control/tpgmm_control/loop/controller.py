@@ -254,7 +254,7 @@ class Controller:
         if clock.kind == "localizing" and clock.initial == "anywhere":
             before = replace(self._places, end=min(end, self._gates.find_span(0)[1]))
             for row in range(len(rows)):
-                time[row] = before.first(row, self.holding, start)
+                time[row] = before.find_start(row, self.holding, start)
         self._clock, self._end = clock, end
         starts = zip(time.tolist(), rows, strict=True)
         self._progress = [Progress.start(clock, now, end, row) for now, row in starts]
@@ -714,7 +714,7 @@ class Controller:
             self._avoid(tick, before)
 
     def _lead(self, wanted: Tensor, running: Flags, measured: Tensor) -> Tensor:
-        """Where references go (..., n_joints), of robots that do not run in other ways."""
+        """Find where references go (..., n_joints): of robots that do not run, elsewhere."""
         busy, beyond = self._holds.busy(wanted), 0.0 if self._gaps is None else self._gaps.gap
         led = np.array(_rows(as_array(wanted - beyond)), np.float64)
         for row in np.flatnonzero(~running).tolist():

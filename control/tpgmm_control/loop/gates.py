@@ -85,7 +85,7 @@ class Grip:
     carries: Tensor
 
     def update(self, hold: Hold, moment: Moment) -> Self:
-        """After a tick."""
+        """Let a tick pass."""
         link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
         holds = moment.no_robot
         if (held := moment.holding.held.get(hold.frame)) is not None:
@@ -95,7 +95,7 @@ class Grip:
         grip = replace(
             self, link=choose(new, link, self.link), thing=choose(new, thing, self.thing)
         )
-        there = grip.carried(hold, moment)
+        there = grip.find_carried(hold, moment)
         off, way = (one.change(there, LOST, LOST_TURN) for one in (thing, grip.thing))
         along = (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
         known = torch.where(moment.unseen[hold.frame], self.carries & ~new, along)
@@ -105,8 +105,8 @@ class Grip:
         """Keep it for some robots (...) alone."""
         return replace(self, holds=self.holds & robots, carries=self.carries & robots)
 
-    def carried(self, hold: Hold, moment: Moment) -> Frame:
-        """Where the object would be if the link had it from then on."""
+    def find_carried(self, hold: Hold, moment: Moment) -> Frame:
+        """Find where the object would be if the link had it from then on."""
         return moment.state.pose(hold.link).compose(self.thing.seen_from(self.link))
 
 
@@ -323,29 +323,35 @@ class Gates:
         for row in rows:
             number = self.robots[row].index
             if number not in unmet:
-                unmet[number] = list(self._unmet(self.gates[number], moment))
+                unmet[number] = list(self._find_unmet(self.gates[number], moment))
             why[row] = next(filter(None, (texts[row] for texts in unmet[number])), "")
         return why
 
-    def _unmet(self, gate: Gate, moment: Moment) -> Iterator[list[str]]:
-        """Of each condition, why robots (B,) do not meet it; empty where they do."""
+    def _find_unmet(self, gate: Gate, moment: Moment) -> Iterator[list[str]]:
+        """Tell of each condition why robots do not meet it; empty where they do."""
         for one in gate.until:
             if one in ("held", "free"):
                 holds = (hold for name, hold in gate.holds if name == one)
-                found = [self._holds(hold, moment, one == "free") for hold in holds]
+                found = [self._check_hold(hold, moment, one == "free") for hold in holds]
             else:
-                found = [_met(one, moment)]
+                found = [_check_condition(one, moment)]
             name = one if isinstance(one, str) else getattr(one, "__name__", "a function")
             for met, whys in found:
                 rows = zip(_rows(met), whys, strict=False)
                 yield ["" if ok else f"{name!r} not met: {why}" for ok, why in rows]
 
-    def _holds(self, hold: Hold, moment: Moment, free: bool) -> tuple[Tensor, Iterable[str]]:
-        """Which robots (...) hold an object, or have let it go, and why others do not."""
+    def _check_hold(
+        self, hold: Hold, moment: Moment, free: bool
+    ) -> tuple[Tensor, Iterable[str]]:
+        """Find robots (...) that hold an object, or let it go, and why others do not."""
         name, grip = hold.frame, self.grips.get(hold)
         if grip is None:
             return moment.no_robot, repeat(f"{name} is nowhere")
-        there, seen, unseen = grip.carried(hold, moment), moment.frames[name], moment.unseen
+        there, seen, unseen = (
+            grip.find_carried(hold, moment),
+            moment.frames[name],
+            moment.unseen,
+        )
         lost = there.change(seen, LOST, LOST_TURN) >= 1
         apart = 1e3 * (there.position - seen.position).norm(dim=-1)
         away = (f"{one:.0f} mm from where {hold.link} would carry it" for one in _rows(apart))
@@ -356,8 +362,8 @@ class Gates:
         return ~grip.holds & ~unseen[name] & lost if free else grip.carries, whys
 
 
-def _met(condition: Condition, moment: Moment) -> tuple[Tensor, Iterable[str]]:
-    """Which robots (...) meet a condition but those of objects, and why others do not."""
+def _check_condition(condition: Condition, moment: Moment) -> tuple[Tensor, Iterable[str]]:
+    """Find robots (...) that meet a condition but those of objects, and why others do not."""
     if condition == "arrived":
         return moment.arrived, repeat("joints move, or are not at their reference")
     if isinstance(condition, str):

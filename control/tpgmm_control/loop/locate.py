@@ -101,7 +101,7 @@ class Seen:
     floor: Array | None = None
 
     @property
-    def known(self) -> Flags:
+    def is_known(self) -> Flags:
         """Joints with readings (n_joints,)."""
         return np.isfinite(self.joints)
 
@@ -330,7 +330,7 @@ class Progress:
         servo, known = self.servo, np.isfinite(readings)
         moved = np.abs(servo.readings.median - servo.readings.near)
         there = moved <= FLOOR / 10 + 2 * servo.std
-        there &= np.abs(servo.corrected - reference) <= servo.floor
+        there &= np.abs(servo.position - reference) <= servo.floor
         still = np.abs(velocity) <= FLOOR
         return self.mode is Mode.RUNNING and bool(((there | ~known) & still).all())
 
@@ -374,7 +374,7 @@ class Progress:
 
     def _advance_time(self, seen: Seen) -> None:
         """Let time go on if the robot follows."""
-        known, judgement, timing = seen.known, self.servo.judgement, self.timing
+        known, judgement, timing = seen.is_known, self.servo.judgement, self.timing
         excess = float(judgement.excess[known].max(initial=0.0))
         lead = max(float(judgement.lead[known].max(initial=0.0)), seen.obstructed)
         stands = seen.halted or self.mode is not Mode.RUNNING
@@ -409,7 +409,7 @@ class Progress:
         following = bisect_left(arrivals, self.time)
         if following == len(arrivals) or time <= arrivals[following]:
             return time
-        gap = np.abs(self.servo.corrected - self.servo.bank.first[0])
+        gap = np.abs(self.servo.position - self.servo.bank.first[0])
         late = bool((gap > self.servo.floor)[known].any())
         return arrivals[following] if late else time
 
@@ -440,7 +440,7 @@ class Progress:
         if self.mode is Mode.PROBING:
             closed = np.maximum(0.5 * probe.opened, self.servo.floor / 2)
             off = off | (probe.stuck & (np.abs(self.servo.gaps.mean) > closed))
-        return seen.known & off
+        return seen.is_known & off
 
     # From mode to mode
 
@@ -474,7 +474,7 @@ class Progress:
         settled = self.timing.in_mode > RESTART + 4 * _longest_lag(servo, off)
         if not (late and settled and self.time < self.end):
             return
-        known = seen.known
+        known = seen.is_known
         if not off.any():  # it stands
             off = known & (servo.measure_asked(self.rest.bank) > FLOOR)
         # what a joint that is slow or held does lies between rest and what its reference did
@@ -485,7 +485,7 @@ class Progress:
         several = moved and off.sum() > 1
         if moved:  # who was displaced is met in all joints
             off = off | known
-        self._switch(Mode.PROBING, np.where(off, servo.corrected, reference))
+        self._switch(Mode.PROBING, np.where(off, servo.position, reference))
         probe = self.probe
         probe.stuck, probe.opened = off, np.abs(servo.gaps.mean)
         probe.displaced, probe.placed, self.comparison = moved, False, None
@@ -494,8 +494,8 @@ class Progress:
 
     def _end_probe(self, reference: Array, seen: Seen, find: Find, explained: bool) -> None:
         """End a probe that tells something."""
-        servo, probe, known = self.servo, self.probe, seen.known
-        posture, resting, displaced = servo.corrected, servo.readings.resting, probe.displaced
+        servo, probe, known = self.servo, self.probe, seen.is_known
+        posture, resting, displaced = servo.position, servo.readings.resting, probe.displaced
         came, arrived = self._judge_probe(reference, seen, explained)
         if came or (arrived and probe.placed):
             self._switch(Mode.RUNNING, probe.target)
@@ -511,11 +511,11 @@ class Progress:
     def _judge_probe(self, reference: Array, seen: Seen, explained: bool) -> tuple[bool, bool]:
         """Tell whether the robot came back, and whether its reference came to it instead."""
         servo, probe, since = self.servo, self.probe, self.timing.in_mode
-        off, stuck = self._find_off(seen), seen.known & probe.stuck
+        off, stuck = self._find_off(seen), seen.is_known & probe.stuck
         near = bool((np.abs(reference - probe.target)[stuck] < FLOOR / 10).all())
         if off.any():
             return False, near and since > DWELL + 4 * _longest_lag(servo, off)
-        moved = np.abs(servo.corrected - probe.target) > MOTION + 3 * servo.std
+        moved = np.abs(servo.position - probe.target) > MOTION + 3 * servo.std
         came = explained or bool(moved[stuck].any())
         return came or since > PROBE_TIME, near and not came
 
@@ -524,7 +524,7 @@ class Progress:
         readings, probe, rest = self.servo.readings, self.probe, self.rest
         now = np.array((readings.near, readings.median))
         way = np.abs(now - probe.held).min(0)
-        stuck = seen.known & probe.stuck
+        stuck = seen.is_known & probe.stuck
         moved = bool((way > self._motion_of_held)[stuck].any())
         # as far as it is led it may stick: from where nothing more is wanted, time goes on
         there = np.abs(probe.wanted - probe.target) < self._compute_lead()
@@ -542,7 +542,7 @@ class Progress:
         """Find another place of the skill where a robot is, to go on there."""
         if self.clock.kind != "localizing":
             return False
-        place = find(np.where(known, self.servo.corrected, self.probe.target))
+        place = find(np.where(known, self.servo.position, self.probe.target))
         if place is None or abs(place - self.time) <= NEARBY:
             return False
         self.go_on_from(place)

@@ -56,19 +56,21 @@ class LagBank:
         Low pass of ``second``: motion is what is beside it.
     score : array of shape (K, n_joints)
         Logarithm of the likelihood of the lags, up to a constant.
+    weight : array of shape (K, n_joints)
+        Posterior of the lags.
     """
 
     first: Array
     second: Array
     slow: Array
     score: Array
+    weight: Array
 
-    def compute_weight(self) -> Array:
-        """Compute the posterior of the lags (K, n_joints); the other joints are a prior."""
-        alone = np.exp(self.score)
-        alone /= alone.sum(0)
-        weight: Array = alone * alone.sum(-1, keepdims=True)
-        return weight / weight.sum(0)
+    @classmethod
+    def start(cls, posture: Array, score: Array) -> Self:
+        """Begin at rest in a posture (n_joints,)."""
+        bank = np.broadcast_to(posture, score.shape)
+        return cls(bank, bank, bank, score, _compute_weight(score))
 
     def advance(self, reference: Array, dt: float) -> Self:
         """Let the servos run towards a reference (n_joints,) for a time [s]."""
@@ -212,10 +214,10 @@ class Servo:
     def start(cls, posture: Array) -> Self:
         """Begin at rest at a reference (n_joints,)."""
         zero, one = np.zeros_like(posture), np.ones_like(posture)
-        bank = np.broadcast_to(posture, (len(LAGS), *posture.shape))
-        none, last = np.zeros(bank.shape), np.broadcast_to(posture, (3, *posture.shape))
+        none = np.zeros((len(LAGS), *posture.shape))
+        last = np.broadcast_to(posture, (3, *posture.shape))
         return cls(
-            LagBank(bank, bank, bank, none),
+            LagBank.start(posture, none),
             Readings(last, posture, posture, posture, 1e-6 * one),
             Offset(zero, 16 * OFFSET_STD**2 * one),
             Gaps(None, none, zero),
@@ -230,7 +232,7 @@ class Servo:
         return copy.copy(self)
 
     @property
-    def corrected(self) -> Array:
+    def position(self) -> Array:
         """Positions of the joints (n_joints,): readings less offsets."""
         return self.readings.median - self.offset.mean
 
@@ -261,7 +263,7 @@ class Servo:
         learns : bool
             Whether motion teaches lags and offsets.
         """
-        before, weight = self.bank, self.bank.compute_weight()
+        before, weight = self.bank, self.bank.weight
         self.bank = bank = before.advance(reference, dt)
         self.expected, self.lag = (weight * bank.second).sum(0), (weight * LAGS).sum(0)
         known, offset, gap = np.isfinite(reading), self.offset.mean, self.gaps.mean
@@ -325,7 +327,7 @@ class Servo:
             error = np.minimum((ran - motion) ** 2 / (2 * variance), 8.0)
             score = bank.score - moves * (dt / np.maximum(2 * self.lag, dt)) * error
             score = np.maximum(score - score.max(0), -10.0)
-            self.bank = replace(bank, score=score)
+            self.bank = replace(bank, score=score, weight=_compute_weight(score))
 
     def _learn_offsets(self, reference: Array, dt: float, learns: Flags) -> None:
         """Learn offsets by a Kalman filter to which the servo's own motion is noise."""
@@ -347,20 +349,26 @@ class Servo:
 
     def forget_motion(self, joints: Flags) -> None:
         """Let the motion of some joints (n_joints,) teach from now on, not what was before."""
-        weight = self.bank.compute_weight()
-        motion = (weight * (self.bank.second - self.bank.slow)).sum(0)
+        motion = (self.bank.weight * (self.bank.second - self.bank.slow)).sum(0)
         slow = np.where(joints, self.readings.median - motion, self.readings.slow)
         self.readings = replace(self.readings, slow=slow)
 
     def restart_here(self) -> None:
         """Let references begin where the robot was put to."""
-        here, reading = self.corrected, self.readings.median
-        bank = np.broadcast_to(here, self.bank.second.shape)
-        last = np.broadcast_to(self.offset.mean, (3, *bank.shape))
-        self.bank = LagBank(bank, bank, bank, self.bank.score)
+        here, reading, score = self.position, self.readings.median, self.bank.score
+        last = np.broadcast_to(self.offset.mean, (3, *score.shape))
+        self.bank = LagBank.start(here, score)
         self.readings = replace(self.readings, slow=reading, near=reading)
-        self.gaps = Gaps(last, np.zeros(bank.shape), np.zeros_like(here))
+        self.gaps = Gaps(last, np.zeros(score.shape), np.zeros_like(here))
         self.expected = here
+
+
+def _compute_weight(score: Array) -> Array:
+    """Compute the posterior of the lags (K, n_joints); a joint's others are its prior."""
+    alone = np.exp(score)
+    alone /= alone.sum(0)
+    weight: Array = alone * alone.sum(-1, keepdims=True)
+    return weight / weight.sum(0)
 
 
 def _take_median(three: Array) -> Array:
