@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_control.loop.gates import Gates
-from tpgmm_control.loop.locate import HELD, Progress
+from tpgmm_control.loop.locate import Mode, Progress
 from tpgmm_control.loop.patience import Patience
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.servo import Flags
@@ -217,7 +217,7 @@ def refused(last: Command, reason: str) -> Command:
 def statuses(
     batch: Sequence[int],
     names: Sequence[str],
-    progress: Progress,
+    progress: Sequence[Progress],
     wanted: Tensor,
     ended: Flags | None,
     held: Sequence[tuple[Flags | None, str]],
@@ -235,7 +235,8 @@ def statuses(
         Shape of the batch; robots are (B,) in what follows.
     names : sequence of str
         Of the joints.
-    progress : Progress
+    progress : sequence of Progress
+        Of each robot.
     wanted : Tensor of shape (..., n_joints)
         Where robots should be.
     ended : bool array of shape (B,), optional
@@ -253,67 +254,90 @@ def statuses(
     patience : Patience, optional
         Robots that are waited for no longer.
     """
-    codes, texts = _at_gates(progress, gates)
-    if progress.waits.any():
-        texts |= _waiting(progress, names, wanted, inputs)
-        codes[progress.waits] = Status.WAITING.code
-        codes[progress.waits & progress.displaced] = Status.DISPLACED.code
-    if ended is not None:  # with joints that are somewhere else, a robot has not finished
-        off = ended & progress.lasting
-        codes[ended & ~off] = Status.FINISHED.code
-        codes[off] = Status.WAITING.code
-        rows = wanted.numpy(force=True).reshape(len(off), -1)
-        texts |= {row: _gap(progress, row, names, rows) for row in np.flatnonzero(off).tolist()}
+    codes, texts = _find_statuses(progress, names, wanted, ended, inputs, gates)
     for row, (waits, reason) in obstructed.items():
         codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
     for robots, reason in held:
-        if robots is not None:
-            codes[robots] = Status.HOLDING.code
-            texts |= dict.fromkeys(np.flatnonzero(robots).tolist(), reason)
+        rows = [] if robots is None else np.flatnonzero(robots).tolist()
+        codes[rows] = Status.HOLDING.code
+        texts |= dict.fromkeys(rows, reason)
     if patience is not None:
         texts = patience.announce(texts)
-    indices = list(np.ndindex(*batch)) if texts else []
-    reasons = {indices[row]: text for row, text in texts.items()}
+    reasons = _index_reasons(texts, batch)
     if halted is not None and inputs is not None:
         codes[halted] = Status.HOLDING.code
-        found = inputs.reasons(halted.reshape(tuple(batch))).items()
-        reasons |= {index: text for index, text in found if text or index not in reasons}
+        found = inputs.reasons(halted.reshape(tuple(batch)))
+        reasons |= {index: text or reasons.get(index, "") for index, text in found.items()}
     if patience is not None:
         codes[patience.stands] = Status.STOPPED.code
     return codes, reasons
 
 
-def _at_gates(
-    progress: Progress, gates: Gates | None
+def _index_reasons(
+    texts: Mapping[int, str], batch: Sequence[int]
+) -> dict[tuple[int, ...], str]:
+    """Give the reasons of robots by their index in a batch."""
+    indices = list(np.ndindex(*batch)) if texts else []
+    return {indices[row]: text for row, text in texts.items()}
+
+
+def _find_statuses(
+    progress: Sequence[Progress],
+    names: Sequence[str],
+    wanted: Tensor,
+    ended: Flags | None,
+    inputs: Inputs | None,
+    gates: Gates | None,
 ) -> tuple[NDArray[np.int8], dict[int, str]]:
-    """The status of robots whose skill has to be followed by another, and why they stand."""
-    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
-    if gates is not None and gates.reasons:
-        texts |= gates.reasons
-        codes[list(texts)] = Status.WAITING.code
-        codes[gates.failed] = Status.HOLDING.code
+    """Find how far robots follow, as far as their joints tell it, and why they do not."""
+    codes, texts = _find_waits_at_gates(len(progress), gates)
+    rows = [row for row, robot in enumerate(progress) if robot.waits]
+    if rows:
+        texts |= _explain_waiting(progress, rows, names, wanted, inputs)
+    for row in rows:
+        displaced = progress[row].probe.displaced
+        codes[row] = (Status.DISPLACED if displaced else Status.WAITING).code
+    if ended is not None:  # with joints that are somewhere else, a robot has not finished
+        codes[ended] = Status.FINISHED.code
+        off = [row for row in np.flatnonzero(ended).tolist() if progress[row].lasting]
+        codes[off] = Status.WAITING.code
+        to = wanted.numpy(force=True).reshape(len(progress), -1)
+        texts |= {row: _describe_gap(progress[row], names, to[row]) for row in off}
     return codes, texts
 
 
-def _waiting(
-    progress: Progress, names: Sequence[str], wanted: Tensor, inputs: Inputs | None
+def _find_waits_at_gates(
+    count: int, gates: Gates | None
+) -> tuple[NDArray[np.int8], dict[int, str]]:
+    """Find which robots stand at the end of a skill before another, and why."""
+    codes, texts = np.zeros(count, np.int8), dict[int, str]()
+    for row, robot in enumerate(() if gates is None else gates.robots):
+        if robot.reason:
+            texts[row] = robot.reason
+            codes[row] = (Status.HOLDING if robot.failed else Status.WAITING).code
+    return codes, texts
+
+
+def _explain_waiting(
+    progress: Sequence[Progress],
+    rows: Sequence[int],
+    names: Sequence[str],
+    wanted: Tensor,
+    inputs: Inputs | None,
 ) -> dict[int, str]:
-    """For which joint each robot is waited."""
-    to = wanted.numpy(force=True).reshape(len(progress.time), -1)
-    rows = np.flatnonzero(progress.waits).tolist()
-    texts = {row: _gap(progress, row, names, to) for row in rows}
+    """Tell for which joint each of some robots is waited."""
+    to = wanted.numpy(force=True).reshape(len(progress), -1)
+    texts = {row: _describe_gap(progress[row], names, to[row]) for row in rows}
     if inputs is not None:
-        frozen = np.flatnonzero(progress.waits & inputs.frozen.reshape(-1)).tolist()
-        texts |= {row: f"{texts[row]}; {FROZEN}" for row in frozen}
+        frozen = inputs.frozen.reshape(-1)
+        texts |= {row: f"{texts[row]}; {FROZEN}" for row in rows if frozen[row]}
     return texts
 
 
-def _gap(progress: Progress, row: int, names: Sequence[str], wanted: Array) -> str:
-    """For which joint a robot is waited, and how far it is off."""
+def _describe_gap(progress: Progress, names: Sequence[str], wanted: Array) -> str:
+    """Tell for which joint a robot is waited, and how far it is off."""
     servo = progress.servo
-    gap = servo.gap[row]
-    if progress.mode[row] == HELD:
-        gap = servo.corrected[row] - wanted[row]
+    gap = servo.position - wanted if progress.mode is Mode.HELD else servo.gaps.mean
     joint = int(np.abs(gap).argmax())
-    offset = servo.offset[row, joint]
+    offset = servo.offset.mean[joint]
     return f"joint {names[joint]!r} is {gap[joint]:+.3f} off, beside an offset of {offset:+.3f}"

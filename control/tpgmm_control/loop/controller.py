@@ -61,7 +61,7 @@ from tpgmm_control.loop.estimate import choose, estimate
 from tpgmm_control.loop.gates import Gates, Moment
 from tpgmm_control.loop.gripping import gripping_joints
 from tpgmm_control.loop.hold import Holds
-from tpgmm_control.loop.locate import CATCH_UP, LONGEST_TICK, RUNNING, Progress, Seen
+from tpgmm_control.loop.locate import CATCH_UP, LONGEST_TICK, Mode, Progress, Seen
 from tpgmm_control.loop.patience import Patience
 from tpgmm_control.loop.places import Places
 from tpgmm_control.loop.reach import Fade, nearest
@@ -241,7 +241,7 @@ class Controller:
         self._gaps = ExpectedGaps.start(skill, start, blend)
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
-        self._avoidance, batch = None, len(self._progress.time)
+        self._avoidance, batch = None, len(self._progress)
         if obstacles is not None:
             self._avoidance = Avoidance.start(obstacles, kinematics, bounds, batch)
             self._holds = self._holds.of_solids(obstacles.geometry.objects)
@@ -254,13 +254,15 @@ class Controller:
         if clock.wait_limit < math.inf:
             self._patience = Patience(clock.wait_limit, np.zeros(len(rows)))
         time = np.full(len(rows), begin, np.float64)
-        self._gates = Gates.start(self._skill.gates, time, end, self._trusts)
+        self._gates = Gates.start(self._skill.gates, time.tolist(), end, self._trusts)
         if clock.kind == "localizing" and clock.initial == "anywhere":
-            before = replace(self._places, end=min(end, float(self._gates.stop[0])))
+            before = replace(self._places, end=min(end, self._gates.find_span(0)[1]))
             for row in range(len(rows)):
-                time[row] = before.first(row, self.holding, start)
-        progress = Progress.start(clock, time, end, rows)
-        self._progress = replace(progress, stop=self._gates.stop)
+                time[row] = before.find_start(row, self.holding, start)
+        self._clock, self._end = clock, end
+        starts = zip(time.tolist(), rows, strict=True)
+        self._progress = [Progress.start(clock, now, end, row) for now, row in starts]
+        self._limit_times()
         # robots that begin in the middle of the skill stand where no demonstration starts
         midway = torch.from_numpy(time > begin + START * (end - begin))
         midway = midway.view(start.shape[:-1]).to(start.device)
@@ -297,16 +299,25 @@ class Controller:
     @property
     def time(self) -> Tensor:
         """Progress at the last step [s], the same () for all robots or of each one (...)."""
-        time, even = self._progress.time, self._progress.clock.kind == "even"
-        if even and (time == time[0]).all():
-            return torch.as_tensor(time[0]).to(self.reference)
-        return self._tensor(time)
+        times = self._times
+        if self._clock.kind == "even" and (times == times[0]).all():
+            return torch.as_tensor(times[0]).to(self.reference)
+        return self._tensor(times)
+
+    @property
+    def _times(self) -> Array:
+        """Progress of the robots (B,) [s]."""
+        return np.array([robot.time for robot in self._progress])
+
+    @property
+    def _running(self) -> Flags:
+        """Robots (B,) that follow the skill."""
+        return np.array([robot.mode is Mode.RUNNING for robot in self._progress])
 
     @property
     def finished(self) -> bool:
         """Whether all robots' references are at the end: further steps hold the last ones."""
-        progress = self._progress
-        ended = self.command is not None and bool((progress.time >= progress.end).all())
+        ended = self.command is not None and bool((self._times >= self._end).all())
         return ended and bool(self._fade.done.all())
 
     def step(
@@ -380,7 +391,9 @@ class Controller:
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
-        return copy.copy(self)  # its states are replaced, never changed
+        other = copy.copy(self)  # other states are replaced, never changed
+        other._progress = [robot.copy() for robot in self._progress]
+        return other
 
     def ahead(self) -> Self:
         """The same moment, to look ahead from: robots will follow, and objects will stay."""
@@ -425,9 +438,9 @@ class Controller:
         paused = None
         if np.max(seconds) > PAUSE:
             warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
-            paused = np.broadcast_to(np.ravel(seconds) > PAUSE, len(self._progress.time))
+            paused = np.broadcast_to(np.ravel(seconds) > PAUSE, len(self._progress))
         seconds = np.minimum(seconds, LONGEST_TICK)
-        usual = self._progress.usual_dt
+        usual = np.array([robot.timing.usual_dt for robot in self._progress])
         most = CATCH_UP * np.where(usual > 0, usual, np.ravel(seconds))
         drive: Seconds = seconds
         if (np.ravel(seconds) > most).any():
@@ -468,20 +481,21 @@ class Controller:
     def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
         assert self._inputs is not None
-        reading, progress = self._inputs.joints, self._progress
+        reading = self._inputs.joints
         if reading is None or not reading.pending.any():
             return
-        servo = progress.servo
-        postures = _rows(reading.rival) - servo.offset
-        if self._gripping is not None:  # of which readings tell nothing
-            postures = np.where(as_array(self._gripping), servo.expected, postures)
-        away = np.abs(postures - servo.expected) - servo.usual
-        explained = away.max(-1) <= reading.trust.joint_jump
-        pending = reading.pending.reshape(-1)
-        if progress.clock.kind == "localizing":
-            for row in np.flatnonzero(pending & ~explained):
-                explained[row] = self._find(int(row), postures[row]) is not None
-        explained &= pending
+        gripping = None if self._gripping is None else as_array(self._gripping)
+        explained: Flags = np.zeros(len(self._progress), bool)
+        for row in np.flatnonzero(reading.pending).tolist():
+            robot, servo = self._progress[row], self._progress[row].servo
+            posture = _rows(reading.rival)[row] - servo.offset.mean
+            if gripping is not None:  # of which readings tell nothing
+                posture = np.where(gripping, servo.expected, posture)
+            away = np.abs(posture - servo.expected) - servo.judgement.usual
+            explained[row] = away.max() <= reading.trust.joint_jump or (
+                self._clock.kind == "localizing"
+                and self._find(row, robot.time, posture) is not None
+            )
         accepted = reading.accept(explained.reshape(reading.pending.shape))
         self._inputs = replace(self._inputs, joints=accepted)
 
@@ -489,41 +503,56 @@ class Controller:
         """Progress of each robot."""
         if tick.first:
             return
-        before = self._progress
-        none: Flags = np.zeros(len(before.time), bool)
-        passed = none + np.ravel(tick.seconds)
-        still = self._stands(tick)
+        before, passed, still = self._times, self._measure_tick(tick), self._stands(tick)
         tick.obstructed = self._obstruction(passed)
+        obstructed = np.zeros(len(before)) if tick.obstructed is None else tick.obstructed
         if not self._trusts and tick.joints is None:
-            self._progress = before.even(np.where(still, 0.0, passed), tick.obstructed)
+            steps = np.where(still, 0.0, passed).tolist()
+            for robot, step, much in zip(
+                self._progress, steps, obstructed.tolist(), strict=True
+            ):
+                robot.advance_unseen(step, much)
         else:
-            reference = _rows(as_array(self._wanted_posture))
-            known, jumped = tick.joints, none
-            readings = reference * np.nan if known is None else _rows(as_array(known))
-            if self._inputs is not None:
-                jumped = self._inputs.jumped.reshape(-1)
-                still = still | self._inputs.jumping.reshape(-1)
-            floor = None if self._gaps is None else self._gaps.floor
-            seen = Seen(passed, readings, jumped, still, tick.obstructed, floor)
-            self._progress = before.advance(reference, seen, self._find)
-            self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
-        over = (self._progress.time >= before.end) & (before.time >= before.end)
+            self._advance_progress(tick, passed, still, obstructed)
+        over = (self._times >= self._end) & (before >= self._end)
         over &= self._fade.done.numpy(force=True).reshape(-1)
         tick.ended = self._tensor(over) if over.any() else None
+
+    def _advance_progress(
+        self, tick: _Tick, passed: Array, still: Flags, obstructed: Array
+    ) -> None:
+        """Let robots (B,) make progress by what is measured."""
+        reference, running = _rows(as_array(self._wanted_posture)), self._running
+        joints = reference * np.nan if tick.joints is None else _rows(as_array(tick.joints))
+        jumped: Flags = np.zeros(len(passed), bool)
+        if self._inputs is not None:
+            jumped = self._inputs.jumped.reshape(-1)
+            still = still | self._inputs.jumping.reshape(-1)
+        columns = (each.tolist() for each in (passed, jumped, still, obstructed))
+        for row, (dt, jumps, halted, much) in enumerate(zip(*columns, strict=True)):
+            robot = self._progress[row]
+            floor = None if self._gaps is None else self._gaps.floor[row]
+            seen = Seen(dt, joints[row], jumps, halted, much, floor)
+            find = functools.partial(self._find, row, robot.time)
+            robot.advance(reference[row], seen, find)
+        self._resume(~running & self._running)
+
+    def _measure_tick(self, tick: _Tick) -> Array:
+        """Compute the duration of the tick for each robot (B,) [s]."""
+        return np.zeros(len(self._progress)) + np.ravel(tick.seconds)
 
     def _obstruction(self, passed: Array) -> Array | None:
         """How much obstacles hold robots up (B,)."""
         if self._avoidance is None or not self._avoidance.led.any():
             return None
-        progress = self._progress
-        stops = {*progress.clock.arrivals, progress.end}
+        stops = {*self._clock.arrivals, self._end}
         stops.update(time for hold in self._skill.holds for time in (hold.begin, hold.end))
-        soon = progress.time + CATCH_UP * progress.clock.speed * passed
-        return self._avoidance.obstruction(progress.time, soon, sorted(stops))
+        soon = self._times + CATCH_UP * self._clock.speed * passed
+        return self._avoidance.obstruction(self._times, soon, sorted(stops))
 
     def _resume(self, robots: Flags) -> None:
         """Robots go on from where they are: those given, and those at another time."""
-        robots = robots | self._progress.relocalized
+        robots = robots | np.array([robot.relocalized for robot in self._progress])
         if robots.any():
             self._fade = self._fade.again(self._tensor(robots))
             if self._gaps is not None:
@@ -535,45 +564,58 @@ class Controller:
         """Count for how long robots are waited for."""
         assert self._patience is not None
         waits = command.of(Status.WAITING) | command.of(Status.DISPLACED)
-        passed = np.zeros(len(self._progress.time)) + np.ravel(tick.seconds)
+        passed = np.zeros(len(self._progress)) + np.ravel(tick.seconds)
         indices = list(np.ndindex(*self.reference.shape[:-1]))
         why = {row: command.reason(index) for row, index in enumerate(indices)}
         why = {row: text.partition("; stops for good")[0] for row, text in why.items()}
         flags = waits.numpy(force=True).reshape(-1)
         self._patience = self._patience.advance(flags, passed, why)
 
-    def _find(self, row: int, posture: Array) -> float | None:
-        """A time of the skill that explains a robot's posture."""
-        now, gates = float(self._progress.time[row]), self._gates
-        if gates.failed[row]:
+    def _find(self, row: int, now: float, posture: Array) -> float | None:
+        """Find a time of the skill that explains a robot's posture."""
+        if self._gates.robots[row].failed:
             return None
-        within = float(gates.since[row]), float(gates.stop[row])
+        within = self._gates.find_span(row)
         like = self.reference.detach()
         return self._places.find(row, posture, now, self.holding, like, within)
 
     def _gate(self, tick: _Tick) -> None:
         """Robots that wait for the end of one skill to be what the next one needs."""
-        if tick.first or (self._gates.index == len(self._gates.gates)).all():
+        if tick.first or self._gates.over:
             return
-        progress, postures = self._progress, self._postures(tick, measured=True)
-        passed = np.zeros(len(progress.time)) + np.ravel(tick.seconds)
-        ready = (progress.mode == RUNNING) & ~self._stands(tick)
+        postures, passed = self._postures(tick, measured=True), self._measure_tick(tick)
+        ready = self._running & ~self._stands(tick)
         moment = None
-        if self._inputs is not None and np.isfinite(self._gates.stop).any():
+        if self._inputs is not None and any(stop is not None for stop in self._gates.stops):
             moment = self._moment(tick, postures)
-        self._gates = gates = self._gates.advance(progress.time, passed, ready, moment)
-        self._progress = progress.gated(gates.stop, gates.goto)
-        begin, back = (self._tensor(each) for each in (gates.fade > 0, gates.returned))
+        self._gates = self._gates.advance(self._times, passed, ready, moment)
+        self._limit_times()
+        self._pass_gates(postures)
+
+    def _pass_gates(self, postures: Tensor) -> None:
+        """Go on from other times at postures (..., n_joints)."""
+        passages = self._gates.robots
+        for robot, passage in zip(self._progress, passages, strict=True):
+            if passage.goto is not None:
+                robot.go_on_from(passage.goto)
+        fades = self._tensor(np.array([passage.fade for passage in passages]))
+        returned = np.array([passage.goes_back for passage in passages])
+        begin, back = fades > 0, self._tensor(returned)
         if begin.any():  # a skill begins with objects where they are now
             self._holds = self._holds.restarted(begin, postures)
-            self._fade = self._fade.again(begin, self._tensor(gates.fade))
+            self._fade = self._fade.again(begin, fades)
         if back.any():
             self._holds = self._holds.released(back, postures, self._frames)
-            self._resume(gates.returned)
+            self._resume(returned)
+
+    def _limit_times(self) -> None:
+        """Let robots go no further than their gates."""
+        for robot, stop in zip(self._progress, self._gates.stops, strict=True):
+            robot.stop = stop
 
     def _stands(self, tick: _Tick) -> Flags:
         """Robots (B,) without accepted inputs, or whose time did not increase."""
-        none: Flags = np.zeros(len(self._progress.time), bool)
+        none: Flags = np.zeros(len(self._progress), bool)
         return np.logical_or.reduce(
             [none, *(x for x in (tick.halted, tick.late) if x is not None)]
         )
@@ -583,7 +625,8 @@ class Controller:
         reference, velocity = self._wanted_posture.detach(), self._following.velocity.detach()
         readings = torch.nan * reference if tick.joints is None else tick.joints
         arrays = (_rows(as_array(each)) for each in (reference, velocity, readings))
-        arrived = self._tensor(self._progress.arrived(*arrays))
+        robots = zip(self._progress, *arrays, strict=True)
+        arrived = self._tensor(np.array([robot.check_arrival(*at) for robot, *at in robots]))
         assert self._inputs is not None
         every, poses, lost = torch.ones_like(arrived), self._inputs.poses, self._inputs.lost
         unseen = {n: lost.get(n, every & (n not in poses)) for n in self._frames}
@@ -629,7 +672,7 @@ class Controller:
             posture = posture + (self._following.reference - self.reference)
         shift, self._fade = self._fade.advance(posture, found.joints, seconds, tick.first)
         if self._gaps is not None:
-            time = np.zeros(len(self._progress.time)) + as_array(tick.time).reshape(-1)
+            time = np.zeros(len(self._progress)) + as_array(tick.time).reshape(-1)
             self._gaps = self._gaps.advance(self._skill, time, seconds, tick.first)
             shift = self._gaps.gap if shift is None else shift + self._gaps.gap
         wanted, fitting = self._rounded(found.joints, shift), None
@@ -676,16 +719,9 @@ class Controller:
         self, tick: _Tick, found: Estimate, wanted: Tensor, fitting: Follower | None
     ) -> None:
         """The next references, within the bounds."""
-        self._found, goal, progress = found, wanted, self._progress
-        if (progress.mode != RUNNING).any() and tick.joints is not None:
-            busy, beyond = (
-                self._holds.busy(wanted),
-                0.0 if self._gaps is None else self._gaps.gap,
-            )
-            self._progress, led = progress.led(_rows(as_array(wanted - beyond)), busy)
-            alone = self._tensor(progress.mode == RUNNING).unsqueeze(-1)
-            alone = alone | tick.joints.isnan()
-            goal = torch.where(alone, wanted, self._tensor(led).to(wanted) + beyond)
+        self._found, goal, running = found, wanted, self._running
+        if not running.all() and tick.joints is not None:
+            goal = self._lead(wanted, running, tick.joints)
         halted, late = (
             None if robots is None else self._tensor(robots)
             for robots in (None if tick.first else tick.halted, tick.late)
@@ -697,11 +733,20 @@ class Controller:
         if before is not None and not tick.first:
             self._avoid(tick, before)
 
+    def _lead(self, wanted: Tensor, running: Flags, measured: Tensor) -> Tensor:
+        """Find where references go (..., n_joints): of robots that do not run, elsewhere."""
+        busy, beyond = self._holds.busy(wanted), 0.0 if self._gaps is None else self._gaps.gap
+        led = np.array(_rows(as_array(wanted - beyond)), np.float64)
+        for row in np.flatnonzero(~running).tolist():
+            led[row] = self._progress[row].lead(led[row].copy(), bool(busy[row]))
+        alone = self._tensor(running).unsqueeze(-1) | measured.isnan()
+        return torch.where(alone, wanted, self._tensor(led).to(wanted) + beyond)
+
     def _avoid(self, tick: _Tick, before: Follower) -> None:
         """The references that are sent, clear of obstacles."""
         after = self._following.follower
         if self._avoidance is not None and after is not None:
-            none: Flags = np.zeros(len(self._progress.time), bool)
+            none: Flags = np.zeros(len(self._progress), bool)
             state = self._state(self.reference) if self.holding.carries else None
             self._avoidance = self._avoidance.advance(
                 before, after, state, self.holding.frames,
@@ -711,14 +756,14 @@ class Controller:
 
     def _send(self, tick: _Tick) -> Command:
         """The command, with the status of each robot."""
-        following, progress = self._following, self._progress
+        following, robots = self._following, self._progress
         lost = None if following.lost is None else following.lost.numpy(force=True).reshape(-1)
         ended = None if tick.ended is None else tick.ended.numpy(force=True).reshape(-1)
         blocked: Mapping[int, tuple[bool, str]] = self._behind()
         if tick.obstructed is not None and self._avoidance is not None:
             blocked = {**blocked, **self._avoidance.reasons(tick.obstructed)}
         codes, reasons = commands.statuses(
-            self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
+            self.reference.shape[:-1], self._skill.kinematics.joint_names, robots,
             following.wanted, ended,
             ((lost, NO_ANSWER), (tick.late, NOT_INCREASED), (tick.paused, PAUSED)),
             tick.halted, self._inputs, self._gates, blocked, self._patience,
@@ -732,8 +777,8 @@ class Controller:
             reasons,
             self._impedance,
             self._novelty(),
-            self._tensor(progress.relocalized),
-            self._tensor(progress.servo.offset),
+            self._tensor(np.array([robot.relocalized for robot in robots])),
+            self._tensor(np.array([robot.servo.offset.mean for robot in robots])),
         )
         return self.command
 

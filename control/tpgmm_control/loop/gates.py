@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import repeat
 from typing import Any, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_control.loop.hold import LOST, LOST_TIME, LOST_TURN
@@ -85,7 +85,7 @@ class Grip:
     carries: Tensor
 
     def update(self, hold: Hold, moment: Moment) -> Self:
-        """After a tick."""
+        """Let a tick pass."""
         link, thing = moment.state.pose(hold.link), moment.frames[hold.frame]
         holds = moment.no_robot
         if (held := moment.holding.held.get(hold.frame)) is not None:
@@ -95,132 +95,219 @@ class Grip:
         grip = replace(
             self, link=choose(new, link, self.link), thing=choose(new, thing, self.thing)
         )
-        there = grip.carried(hold, moment)
+        there = grip.find_carried(hold, moment)
         off, way = (one.change(there, LOST, LOST_TURN) for one in (thing, grip.thing))
         along = (way >= MOVED / LOST) & (off < (SHARE * way).clamp(max=1.0))
         known = torch.where(moment.unseen[hold.frame], self.carries & ~new, along)
         return replace(grip, holds=holds, carries=holds & known)
 
-    def kept(self, robots: Tensor) -> Self:
-        """For some robots (...) alone."""
+    def keep(self, robots: Tensor) -> Self:
+        """Keep it for some robots (...) alone."""
         return replace(self, holds=self.holds & robots, carries=self.carries & robots)
 
-    def carried(self, hold: Hold, moment: Moment) -> Frame:
-        """Where the object would be if the link had it from then on."""
+    def find_carried(self, hold: Hold, moment: Moment) -> Frame:
+        """Find where the object would be if the link had it from then on."""
         return moment.state.pose(hold.link).compose(self.thing.seen_from(self.link))
+
+
+@dataclass(frozen=True)
+class Passage:
+    """Where one robot is among the gates of a skill; immutable.
+
+    Parameters
+    ----------
+    tries : tuple of int
+        How often each gate took too long.
+    index : int
+        Number of gates that are behind the robot.
+    waited, met_for : float
+        For how long it has stood at a gate, and its conditions were met [s].
+    failed : bool
+        Whether it has given up.
+    goto : float, optional
+        Where its time is set to at this tick [s].
+    fade : float
+        How long it takes to the beginning of a separate skill; 0 if none begins [s].
+    reason : str
+        What it waits for, or why it gave up.
+    """
+
+    tries: tuple[int, ...]
+    index: int = 0
+    waited: float = 0.0
+    met_for: float = 0.0
+    failed: bool = False
+    goto: float | None = None
+    fade: float = 0.0
+    reason: str = ""
+
+    @property
+    def goes_back(self) -> bool:
+        """True if the robot goes back at this tick."""
+        return self.goto is not None and self.fade == 0
+
+    def open(self, gate: Gate, time: float) -> Self:
+        """Pass the next gate, and go on from a time [s]."""
+        goto = time if gate.fade > 0 else self.goto
+        return replace(self, index=self.index + 1, fade=self.fade + gate.fade, goto=goto)
+
+    def decide(self, gates: tuple[Gate, ...], unmet: str, dt: float) -> Self:
+        """Wait at a gate, go on, go back, or give up.
+
+        Parameters
+        ----------
+        gates : tuple of Gate
+            Of the skill.
+        unmet : str
+            Why the robot may not go on; empty if it may.
+        dt : float
+            Duration of the tick [s].
+        """
+        gate = gates[self.index]
+        if unmet:
+            new = replace(self, met_for=0.0, reason=unmet)
+            return new if self.waited < gate.timeout else new._try_again(gates)
+        met_for = self.met_for + dt
+        if met_for >= LOST_TIME:
+            return replace(self, waited=0.0, met_for=0.0, reason="").open(gate, gate.onward)
+        text = f"met for {met_for:.1f} s of {LOST_TIME:g} s"
+        return replace(self, met_for=met_for, reason=text)
+
+    def _try_again(self, gates: tuple[Gate, ...]) -> Self:
+        """Go back, or give up, at a gate that took too long."""
+        gate, tries = gates[self.index], list(self.tries)
+        tries[self.index] += 1
+        count = tries[self.index]
+        new = replace(self, tries=tuple(tries))
+        if count > gate.retries:
+            after = f" not met after {count} tries" if count > 1 else " not met"
+            return replace(new, failed=True, reason=self.reason.replace(" not met", after, 1))
+        index = bisect_right([each.time for each in gates], gate.back)
+        return replace(new, index=index, waited=0.0, goto=gate.back, reason="")
 
 
 @dataclass(frozen=True, eq=False)
 class Gates:
-    """Where B robots are among the gates of a skill; immutable.
+    """Where robots are among the gates of a skill; immutable.
 
     Parameters
     ----------
     gates : tuple of Gate
-    closed : array of shape (G + 1,)
-        Time beyond which robots do not go, by the number of gates behind them [s].
-    index : int array of shape (B,)
-        That number.
-    waited, met_for : array of shape (B,)
-        For how long they have stood at a gate, and its conditions were met [s].
-    tries : int array of shape (B, G)
-        How often that took too long.
-    failed : bool array of shape (B,)
-        Robots that have given up.
-    goto, fade : array of shape (B,)
-        Where the time of robots is set to at this tick, NaN if it is not, and how long it takes
-        to the beginning of a separate skill, 0 if none begins [s].
-    reasons : mapping of int to str
-        What robots wait for, or why they gave up.
+    closed : tuple of float or None
+        Time beyond which robots do not go, by the number of gates behind them [s]; None where
+        no gate is closed.
+    robots : tuple of Passage
     grips : mapping of Hold to Grip
         Of the objects that conditions ask for.
     """
 
     gates: tuple[Gate, ...]
-    closed: Array
-    index: NDArray[np.int_]
-    waited: Array
-    met_for: Array
-    tries: NDArray[np.int_]
-    failed: Flags
-    goto: Array
-    fade: Array
-    reasons: Mapping[int, str] = field(default_factory=dict)
+    closed: tuple[float | None, ...]
+    robots: tuple[Passage, ...]
     grips: Mapping[Hold, Grip] = field(default_factory=dict)
 
     @classmethod
-    def start(cls, gates: tuple[Gate, ...], time: Array, end: float, enforced: bool) -> Self:
-        """At times (B,) of a skill; without enforcement all conditions count as met."""
-        first = float(time.min())
+    def start(
+        cls, gates: tuple[Gate, ...], times: Sequence[float], end: float, enforced: bool
+    ) -> Self:
+        """Begin at times of a skill; without enforcement all conditions count as met."""
+        first = min(times)
         later = (gate for gate in gates if first < gate.time <= end)
         known = tuple(replace(gate, back=max(gate.back, first)) for gate in later)
-        last = np.nextafter(end, -np.inf)  # at the end itself a robot is done
-        stops = [min(g.time, last) if enforced and g.until else np.inf for g in known]
-        closed = np.minimum.accumulate([np.inf, *stops[::-1]])[::-1]
-        zero, tries = np.zeros(len(time)), np.zeros((len(time), len(known)), int)
-        none = zero > 0
-        return cls(known, closed, none.astype(int), zero, zero, tries, none, zero, zero)
+        last = math.nextafter(end, -math.inf)  # at the end itself a robot is done
+        closed: list[float | None] = [None]
+        for gate in reversed(known):
+            stop = closed[0]
+            if enforced and gate.until:
+                stop = min(gate.time, last)
+            closed.insert(0, stop)
+        return cls(known, tuple(closed), tuple(Passage((0,) * len(known)) for _ in times))
 
     @property
-    def stop(self) -> Array:
-        """Times beyond which robots do not go (B,) [s]."""
-        return self.closed[self.index]
+    def over(self) -> bool:
+        """True if all gates are behind all robots."""
+        return all(robot.index == len(self.gates) for robot in self.robots)
 
     @property
-    def since(self) -> Array:
-        """Beginnings of the skills in which robots are (B,) [s]."""
-        return np.array([-np.inf, *(gate.time + gate.fade for gate in self.gates)])[self.index]
+    def stops(self) -> list[float | None]:
+        """Times beyond which robots do not go [s]."""
+        return [self.closed[robot.index] for robot in self.robots]
 
-    @property
-    def returned(self) -> Flags:
-        """Robots that go back at this tick."""
-        return np.isfinite(self.goto) & (self.fade == 0)
+    def find_span(self, row: int) -> tuple[float, float]:
+        """Find between which times of the skill a robot may go on [s]."""
+        index = self.robots[row].index
+        stop = self.closed[index]
+        begin = self.gates[index - 1].time + self.gates[index - 1].fade if index else -math.inf
+        return begin, math.inf if stop is None else stop
 
-    def advance(self, time: Array, dt: Array, ready: Flags, moment: Moment | None) -> Self:
-        """After a tick.
+    def advance(self, times: Array, passed: Array, ready: Flags, moment: Moment | None) -> Self:
+        """Let a tick pass.
 
         Parameters
         ----------
-        time : array of shape (B,)
+        times : array of shape (B,)
             In the skill [s].
-        dt : array of shape (B,)
+        passed : array of shape (B,)
             Duration of the tick [s].
         ready : bool array of shape (B,)
             Robots that follow their references, of which inputs are accepted.
         moment : Moment, optional
             What is known; without it, as when somebody looks ahead, gates stay as they are.
         """
-        new = replace(self, goto=np.full_like(time, np.nan), fade=np.zeros_like(time))
-        for number, gate in enumerate(self.gates):  # those without conditions
-            if self.closed[number] > gate.time:
-                rows = (new.index == number) & (time > gate.time)
-                new = new._opened(rows, np.maximum(time, gate.onward))
-        stands = time >= new.stop
-        at = stands & ready & ~self.failed
-        new = replace(new, waited=np.where(at, new.waited + dt, stands * new.waited))
+        columns = zip(self.robots, times.tolist(), passed.tolist(), ready.tolist(), strict=True)
+        moved, waiting = list[Passage](), dict[int, float]()
+        for row, (before, time, dt, follows) in enumerate(columns):
+            robot = self._pass_open(replace(before, goto=None, fade=0.0), time)
+            stop = self.closed[robot.index]
+            if stop is None or time < stop:
+                robot = replace(robot, waited=0.0)
+            elif follows and not robot.failed:
+                robot, waiting[row] = replace(robot, waited=robot.waited + dt), dt
+            moved.append(robot)
+        new = replace(self, robots=tuple(moved))
         if moment is None:
-            return replace(new, met_for=new.met_for + (at & (new.met_for > 0)) * dt)
-        waits = (stands & ~at) | self.failed
-        kept = {row: text for row, text in self.reasons.items() if waits[row]}
-        new = replace(
-            new, grips=new._gripped(moment), met_for=stands * new.met_for, reasons=kept
-        )
-        return new._decided(at, dt, moment) if at.any() else new
+            return new._look_ahead(waiting)
+        return new._judge(times, waiting, moment)
 
-    def _opened(self, rows: Flags, time: Any) -> Self:
-        """Some robots have passed the next gate, and go on from a time."""
-        if not rows.any():
-            return self
-        fades = np.where(rows, np.array([*(g.fade for g in self.gates), 0.0])[self.index], 0)
-        return replace(
-            self,
-            index=self.index + rows,
-            fade=self.fade + fades,
-            goto=np.where(fades > 0, time, self.goto),
-        )
+    def _pass_open(self, robot: Passage, time: float) -> Passage:
+        """Let a robot pass gates without conditions."""
+        for gate in self.gates[robot.index :]:
+            stop = self.closed[robot.index]
+            if time <= gate.time or (stop is not None and stop <= gate.time):
+                break
+            robot = robot.open(gate, max(time, gate.onward))
+        return robot
 
-    def _gripped(self, moment: Moment) -> Mapping[Hold, Grip]:
-        """The links and objects that conditions ask for."""
+    def _look_ahead(self, waiting: Mapping[int, float]) -> Self:
+        """Count for how long conditions are met that nobody judges."""
+        robots = list(self.robots)
+        for row, dt in waiting.items():
+            if robots[row].met_for > 0:
+                robots[row] = replace(robots[row], met_for=robots[row].met_for + dt)
+        return replace(self, robots=tuple(robots))
+
+    def _judge(self, times: Array, waiting: Mapping[int, float], moment: Moment) -> Self:
+        """Decide whether robots that wait at their gates go on, go back, or give up."""
+        new, robots = replace(self, grips=self._update_grips(moment)), list[Passage]()
+        why = new._explain_unmet(list(waiting), moment)
+        for row, (robot, time) in enumerate(zip(self.robots, times.tolist(), strict=True)):
+            stop = self.closed[robot.index]
+            stands = stop is not None and time >= stop
+            if row in waiting:
+                robot = robot.decide(self.gates, why[row], waiting[row])
+            elif not stands:
+                reason = robot.reason if robot.failed else ""
+                robot = replace(robot, met_for=0.0, reason=reason)
+            robots.append(robot)
+        stays = [not robot.goes_back for robot in robots]
+        grips = new.grips
+        if not all(stays):
+            kept = torch.tensor(stays).view(moment.arrived.shape)
+            grips = {hold: grip.keep(kept) for hold, grip in grips.items()}
+        return replace(new, robots=tuple(robots), grips=grips)
+
+    def _update_grips(self, moment: Moment) -> Mapping[Hold, Grip]:
+        """Follow the links and objects that conditions ask for."""
         grips, no_robot = dict(self.grips), moment.no_robot
         for hold in (hold for gate in self.gates for _, hold in gate.holds):
             if hold.frame in moment.frames:
@@ -230,66 +317,41 @@ class Gates:
                 grips[hold] = grips[hold].update(hold, moment)
         return grips
 
-    def _decided(self, at: Flags, dt: Array, moment: Moment) -> Self:
-        """Robots at their gates wait, go on, go back, or give up."""
-        why = self._asked(at, moment)
-        number = np.minimum(self.index, len(self.gates) - 1)
-        each = np.array([(g.timeout, g.retries, g.back, g.onward) for g in self.gates])
-        timeout, retries, back, onward = each[number].T
-        met = at & np.array([not text for text in why])
-        met_for = np.where(at, met * (self.met_for + dt), self.met_for)
-        late = at & ~met & (self.waited >= timeout)
-        tries = self.tries + late[:, None] * np.eye(len(self.gates), dtype=int)[number]
-        count = tries[np.arange(len(at)), number]
-        fails, goes, opens = late & (count > retries), late & (count <= retries), met
-        opens = opens & (met_for >= LOST_TIME)
-        reasons = dict(self.reasons)
-        for row in np.flatnonzero(at & ~goes & ~opens).tolist():
-            after = f" after {count[row]} tries" if fails[row] and count[row] > 1 else ""
-            text = f"met for {met_for[row]:.1f} s of {LOST_TIME:g} s"
-            reasons[row] = why[row].replace(" not met", f" not met{after}", 1) or text
-        kept = torch.from_numpy(~goes).view(moment.arrived.shape)
-        times = [gate.time for gate in self.gates]
-        return replace(
-            self,
-            index=np.where(goes, np.searchsorted(times, back, side="right"), self.index),
-            waited=np.where(goes | opens, 0.0, self.waited),
-            met_for=np.where(goes | opens, 0.0, met_for),
-            tries=tries,
-            failed=self.failed | fails,
-            goto=np.where(goes, back, self.goto),
-            reasons=reasons,
-            grips={hold: grip.kept(kept) for hold, grip in self.grips.items()},
-        )._opened(opens, onward)
-
-    def _asked(self, at: Flags, moment: Moment) -> list[str]:
-        """Why robots (B,) at their gates may not go on; empty where they may."""
-        why = [""] * len(at)
-        for number in np.unique(self.index[at]).tolist():
-            unmet = list(self._unmet(self.gates[number], moment))
-            for row in np.flatnonzero(at & (self.index == number)).tolist():
-                why[row] = next(filter(None, (texts[row] for texts in unmet)), "")
+    def _explain_unmet(self, rows: Iterable[int], moment: Moment) -> dict[int, str]:
+        """Tell why robots at their gates may not go on; empty where they may."""
+        why, unmet = dict[int, str](), dict[int, list[list[str]]]()
+        for row in rows:
+            number = self.robots[row].index
+            if number not in unmet:
+                unmet[number] = list(self._find_unmet(self.gates[number], moment))
+            why[row] = next(filter(None, (texts[row] for texts in unmet[number])), "")
         return why
 
-    def _unmet(self, gate: Gate, moment: Moment) -> Iterator[list[str]]:
-        """Of each condition, why robots (B,) do not meet it; empty where they do."""
+    def _find_unmet(self, gate: Gate, moment: Moment) -> Iterator[list[str]]:
+        """Tell of each condition why robots do not meet it; empty where they do."""
         for one in gate.until:
             if one in ("held", "free"):
                 holds = (hold for name, hold in gate.holds if name == one)
-                found = [self._holds(hold, moment, one == "free") for hold in holds]
+                found = [self._check_hold(hold, moment, one == "free") for hold in holds]
             else:
-                found = [_met(one, moment)]
+                found = [_check_condition(one, moment)]
             name = one if isinstance(one, str) else getattr(one, "__name__", "a function")
             for met, whys in found:
                 rows = zip(_rows(met), whys, strict=False)
                 yield ["" if ok else f"{name!r} not met: {why}" for ok, why in rows]
 
-    def _holds(self, hold: Hold, moment: Moment, free: bool) -> tuple[Tensor, Iterable[str]]:
-        """Which robots (...) hold an object, or have let it go, and why others do not."""
+    def _check_hold(
+        self, hold: Hold, moment: Moment, free: bool
+    ) -> tuple[Tensor, Iterable[str]]:
+        """Find robots (...) that hold an object, or let it go, and why others do not."""
         name, grip = hold.frame, self.grips.get(hold)
         if grip is None:
             return moment.no_robot, repeat(f"{name} is nowhere")
-        there, seen, unseen = grip.carried(hold, moment), moment.frames[name], moment.unseen
+        there, seen, unseen = (
+            grip.find_carried(hold, moment),
+            moment.frames[name],
+            moment.unseen,
+        )
         lost = there.change(seen, LOST, LOST_TURN) >= 1
         apart = 1e3 * (there.position - seen.position).norm(dim=-1)
         away = (f"{one:.0f} mm from where {hold.link} would carry it" for one in _rows(apart))
@@ -300,8 +362,8 @@ class Gates:
         return ~grip.holds & ~unseen[name] & lost if free else grip.carries, whys
 
 
-def _met(condition: Condition, moment: Moment) -> tuple[Tensor, Iterable[str]]:
-    """Which robots (...) meet a condition but those of objects, and why others do not."""
+def _check_condition(condition: Condition, moment: Moment) -> tuple[Tensor, Iterable[str]]:
+    """Find robots (...) that meet a condition but those of objects, and why others do not."""
     if condition == "arrived":
         return moment.arrived, repeat("joints move, or are not at their reference")
     if isinstance(condition, str):

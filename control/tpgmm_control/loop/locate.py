@@ -1,4 +1,4 @@
-"""Stage *locate*: how far each robot is in its skill, and whether it follows.
+"""Stage *locate*: how far a robot is in its skill, and whether it follows.
 
 A robot is in one of three modes, decided by the gaps that its
 :class:`~tpgmm_control.sensing.servo.Servo` does not explain:
@@ -22,22 +22,31 @@ displaced, and time goes there; a single joint that is off is rather an offset.
 
 from __future__ import annotations
 
+import copy
+from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpgmm_control.loop.clock import Clock
 from tpgmm_control.sensing.servo import FLOOR, STANDSTILL, Flags, Servo
-from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
 
-#: A time of the skill for a robot (row) at a posture, if one explains it.
-Find = Callable[[int, Array], float | None]
+#: A time of the skill that explains a posture (n_joints,), if there is one.
+Find = Callable[[Array], float | None]
 
-RUNNING, PROBING, HELD = range(3)
+
+class Mode(Enum):
+    """Whether a robot follows its skill."""
+
+    RUNNING = "running"  #: time goes on
+    PROBING = "probing"  #: a gap was noticed, and the reference goes back
+    HELD = "held"  #: the robot stands, and the reference leads it by a little
+
+
 #: A loop that stood for longer goes on as if it had stood for that long [s].
 LONGEST_TICK = 0.5
 #: Time goes on so much faster to catch up with what a long tick has cost.
@@ -66,436 +75,492 @@ NEARBY = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Measurements of B robots at a tick.
+    """Measurements of a robot at a tick.
 
     Parameters
     ----------
-    dt : array of shape (B,)
+    dt : float
         Duration of the tick [s].
-    joints : array of shape (B, n_joints)
+    joints : array of shape (n_joints,)
         Accepted readings, NaN elsewhere [rad or m].
-    jumped : bool array of shape (B,)
-        Robots whose readings have jumped to somewhere else, and stay there.
-    halted : bool array of shape (B,)
-        Robots for which time stands: nothing can be trusted, or time did not increase.
-    obstructed : array of shape (B,), optional
-        How much obstacles hold robots up: time goes on the slower, and from 1 on stands.
-    floor : array of shape (B, n_joints), optional
+    jumped : bool
+        Whether readings have jumped to somewhere else, and stay there.
+    halted : bool
+        Whether time stands: nothing can be trusted, or time did not increase.
+    obstructed : float
+        How much obstacles hold the robot up: time goes on the slower, and from 1 on stands.
+    floor : array of shape (n_joints,), optional
         Half the gap that means nothing where the skill is [rad or m].
     """
 
-    dt: Array
+    dt: float
     joints: Array
-    jumped: Flags
-    halted: Flags
-    obstructed: Array | None = None
+    jumped: bool = False
+    halted: bool = False
+    obstructed: float = 0.0
     floor: Array | None = None
+
+    @property
+    def is_known(self) -> Flags:
+        """Joints with readings (n_joints,)."""
+        return np.isfinite(self.joints)
+
+
+@dataclass(eq=False)
+class Timing:
+    """Durations that progress depends on.
+
+    Parameters
+    ----------
+    rate : float
+        Seconds of the skill per second, over the clock's speed.
+    owed : float
+        Time that is still to be caught up [s].
+    usual_dt : float
+        Mean duration of the ticks; 0 before the first [s].
+    in_mode, off : float
+        For how long the robot is in its mode, and has had gaps that are not usual [s].
+    """
+
+    rate: float = 1.0
+    owed: float = 0.0
+    usual_dt: float = 0.0
+    in_mode: float = 0.0
+    off: float = 0.0
+
+    def advance(self, dt: float, halted: bool, stands: bool, rate: float) -> float:
+        """Let a tick pass at a rate; return by how much time goes on, at full rate [s]."""
+        usual = self.usual_dt if self.usual_dt > 0 else dt
+        if not halted:
+            self.usual_dt = usual = usual + 0.1 * (min(dt, 2 * usual) - usual)
+        self.in_mode += dt
+        if stands:
+            self.rate, self.owed = self.rate if halted else 0.0, 0.0
+            return 0.0
+        step = min(self.owed + dt, CATCH_UP * usual)
+        self.rate, self.owed = rate, 0.0 if rate < 1 else self.owed + dt - step
+        return step
+
+    def restart(self) -> None:
+        """Begin another mode."""
+        self.rate = self.owed = self.in_mode = self.off = 0.0
 
 
 @dataclass(frozen=True, eq=False)
+class Comparison:
+    """State of a robot that its later motion is compared with.
+
+    Parameters
+    ----------
+    expected, reading : array of shape (n_joints,)
+        Positions as they were expected, and as they were measured [rad or m].
+    """
+
+    expected: Array
+    reading: Array
+
+
+@dataclass(eq=False)
+class Probe:
+    """Knowledge of a robot that does not run.
+
+    Parameters
+    ----------
+    target : array of shape (n_joints,)
+        Where its reference goes [rad or m].
+    wanted : array of shape (n_joints,)
+        What the skill wanted last.
+    stuck : bool array of shape (n_joints,)
+        Joints that did not follow.
+    opened : array of shape (n_joints,)
+        Size of the gaps then.
+    held : array of shape (n_joints,)
+        Where it was found to be held.
+    displaced, placed : bool
+        Whether somebody else has moved it, and whether its place was found.
+    """
+
+    target: Array
+    wanted: Array
+    stuck: Flags
+    opened: Array
+    held: Array
+    displaced: bool = False
+    placed: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """The rest of a robot before it stopped.
+
+    Parameters
+    ----------
+    reading : array of shape (n_joints,)
+        Where it came to rest [rad or m].
+    bank : array of shape (K, n_joints)
+        Positions of its servos then.
+    time : float
+        In the skill [s].
+    resumed : float, optional
+        Time to which it went back last; None if it never did.
+    """
+
+    reading: Array
+    bank: Array
+    time: float
+    resumed: float | None = None
+
+
+@dataclass(eq=False, kw_only=True)
 class Progress:
-    """Progress of B robots; immutable, made by :meth:`start`.
+    """Progress of one robot; made by :meth:`start`, changed by each tick.
 
     Parameters
     ----------
     clock : Clock
     end : float
         Of the skill [s].
+    stop : float, optional
+        Time beyond which the robot does not go [s].
     servo : Servo
-    time, rate : array of shape (B,)
-        In the skill [s]; seconds of it per second, over the clock's speed.
-    owed, usual_dt : array of shape (B,)
-        Time that is still to be caught up, mean duration of the ticks [s].
-    mode : int array of shape (B,)
-    since, off_for : array of shape (B,)
-        For how long a robot is in its mode, and has gaps that are not usual [s].
-    target : array of shape (B, n_joints)
-        Where the references of robots go that do not run.
-    stuck : bool array of shape (B, n_joints)
-        Joints that did not follow when a robot was no longer running.
-    opened : array of shape (B, n_joints)
-        Size of the gaps then.
-    model, reading : array of shape (B, n_joints)
-        Expected positions and readings from when on motion is compared.
-    compared : bool array of shape (B,)
-        Whether these are known: what opened the gap has to be over.
-    explained : bool array of shape (B,)
-        Robots of which a gap was found to be an offset at this tick.
-    followed : array of shape (2, B, n_joints)
-        Readings and expected positions when a robot last followed.
-    rest : array of shape (B, n_joints)
-        Its reading when it came to rest.
-    rest_bank : array of shape (K, B, n_joints)
-        Its servos then.
-    rest_time, resumed : array of shape (B,)
-        Time in the skill then, and to which a robot went back last [s].
-    displaced, placed, relocalized : bool array of shape (B,)
-        Robots that somebody else has moved; whose place was found; whose time was set at this
-        tick.
-    wanted : array of shape (B, n_joints)
-        What the skill wanted last of robots that do not run.
-    stop : array of shape (B,)
-        Time beyond which robots do not go [s].
+    time : float
+        In the skill [s].
+    relocalized : bool
+        Whether time was set to another one at this tick.
+    mode : Mode
+    timing : Timing
+    probe : Probe
+    rest : Rest
+    comparison : Comparison, optional
+        None before what opened a gap is over.
+    followed : Comparison
+        Expected positions and readings when the robot last followed.
     """
 
     clock: Clock
     end: float
+    stop: float | None = None
     servo: Servo
-    time: Array
-    rate: Array
-    owed: Array
-    usual_dt: Array
-    mode: NDArray[np.int_]
-    since: Array
-    off_for: Array
-    target: Array
-    stuck: Flags
-    opened: Array
-    model: Array
-    reading: Array
-    compared: Flags
-    explained: Flags
-    followed: Array
-    rest: Array
-    rest_bank: Array
-    rest_time: Array
-    resumed: Array
-    displaced: Flags
-    placed: Flags
-    relocalized: Flags
-    wanted: Array
-    stop: Array
+    time: float
+    relocalized: bool = False
+    mode: Mode = Mode.RUNNING
+    timing: Timing
+    probe: Probe
+    rest: Rest
+    comparison: Comparison | None = None
+    followed: Comparison
 
     @classmethod
-    def start(cls, clock: Clock, time: Array, end: float, posture: Array) -> Self:
-        """At times (B,) of the skill, at rest in a posture (B, n_joints)."""
-        zero = np.zeros_like(time)
-        none, both, servo = zero > 0, np.stack((posture, posture)), Servo.at_rest(posture)
+    def start(cls, clock: Clock, time: float, end: float, posture: Array) -> Self:
+        """Begin at a time of the skill, at rest in a posture (n_joints,)."""
+        servo, none = Servo.start(posture), np.zeros(posture.shape, bool)
         return cls(
-            clock, end, servo, time, zero + 1, zero, zero,
-            zero.astype(int), zero, zero, posture, posture < -np.inf, 0 * posture,
-            posture, posture, none, none, both, posture, servo.second, time,
-            zero - np.inf, none, none, none, posture, zero + np.inf,
-        )  # fmt: skip
+            clock=clock,
+            end=end,
+            servo=servo,
+            time=time,
+            timing=Timing(),
+            probe=Probe(posture, posture, none, 0 * posture, posture),
+            rest=Rest(posture, servo.bank.second, time),
+            followed=Comparison(posture, posture),
+        )
+
+    def copy(self) -> Self:
+        """Copy the progress as it is now."""
+        new = copy.copy(self)
+        new.servo, new.timing = self.servo.copy(), copy.copy(self.timing)
+        new.probe = copy.copy(self.probe)
+        return new
 
     @property
-    def waits(self) -> Flags:
-        """Robots that are waited for."""
-        return (self.lasting | (self.mode != RUNNING)) & (self.time < self.end)
+    def waits(self) -> bool:
+        """True while the robot is waited for."""
+        return (self.lasting or self.mode is not Mode.RUNNING) and self.time < self.end
 
     @property
-    def lasting(self) -> Flags:
-        """Robots that have been off for more than a moment."""
-        return self.off_for > np.maximum(DWELL, 2 * self.usual_dt)
+    def lasting(self) -> bool:
+        """True while the robot has been off for more than a moment."""
+        return self.timing.off > max(DWELL, 2 * self.timing.usual_dt)
 
-    def advance(self, reference: Array, seen: Seen, find: Find) -> Self:
-        """Progress after a tick.
+    def advance(self, reference: Array, seen: Seen, find: Find) -> None:
+        """Take in what was measured at a tick.
 
         Parameters
         ----------
-        reference : array of shape (B, n_joints)
+        reference : array of shape (n_joints,)
             What was sent a tick ago.
         seen : Seen
         find : callable
-            ``find(row, posture)``: the time of the skill that explains a robot's posture, or
-            None.
+            ``find(posture)``: the time of the skill that explains a posture, or None.
         """
-        dt = seen.dt[:, None]
-        running = (self.mode == RUNNING) & ~seen.halted
-        servo = self.servo
         if seen.floor is not None:
-            servo = replace_fields(servo, floor=seen.floor)
-        servo = servo.update(reference, seen.joints, dt, seen.jumped[:, None], running[:, None])
-        new = replace_fields(self, servo=servo, relocalized=np.zeros_like(self.placed))
-        new = new._timed(seen)
-        if self.clock.kind == "even" or not (
-            (self.mode != RUNNING).any() or self.compared.any() or (new.off_for > 0).any()
-        ):
-            return new
-        new = new._compared(seen)._noticed(reference, seen, find)
-        return new._probed(reference, seen, find)._released(seen)
+            self.servo.floor = seen.floor
+        learns = self.mode is Mode.RUNNING and not seen.halted
+        self.servo.advance(reference, seen.joints, seen.dt, seen.jumped, learns)
+        self.relocalized = False
+        self._advance_time(seen)
+        if self.clock.kind == "even":
+            return
+        explained = self._compare_motion(seen)
+        if seen.halted:
+            return
+        if self.mode is Mode.RUNNING:
+            self._notice_stop(reference, seen, find)
+        if self.mode is Mode.PROBING:
+            self._end_probe(reference, seen, find, explained)
+        if self.mode is Mode.HELD:
+            self._release(seen)
 
-    def even(self, dt: float | Array, obstructed: Array | None = None) -> Self:
-        """Progress where nothing is measured."""
-        if obstructed is not None and self.clock.kind != "even":
-            dt = dt * np.clip(2 - 2 * obstructed, 0.0, 1.0)
-        return replace_fields(self, time=self._until_end(self.clock.speed * dt))
+    def advance_unseen(self, dt: float, obstructed: float = 0.0) -> None:
+        """Let a tick pass [s] at which nothing is measured."""
+        if self.clock.kind != "even":
+            dt *= min(max(2 - 2 * obstructed, 0.0), 1.0)
+        self.time = self._limit_time(self.clock.speed * dt)
 
-    def arrived(self, reference: Array, velocity: Array, readings: Array) -> Flags:
-        """Robots whose joints are where the reference is, at rest: (B,).
+    def check_arrival(self, reference: Array, velocity: Array, readings: Array) -> bool:
+        """Tell whether all joints are where the reference is, at rest.
 
         Parameters
         ----------
-        reference, velocity : array of shape (B, n_joints)
+        reference, velocity : array of shape (n_joints,)
             What was sent a tick ago [rad or m, rad/s or m/s].
-        readings : array of shape (B, n_joints)
+        readings : array of shape (n_joints,)
             NaN where nothing is measured: there the reference counts.
         """
         servo, known = self.servo, np.isfinite(readings)
-        rests = np.abs(servo.reading - servo.near_reading) <= FLOOR / 10 + 2 * np.sqrt(
-            servo.noise
-        )
-        there = np.abs(servo.corrected - reference) <= servo.floor
-        there = (there & rests) | ~known
-        return (there & (np.abs(velocity) <= FLOOR)).all(-1) & (self.mode == RUNNING)
+        moved = np.abs(servo.readings.median - servo.readings.near)
+        there = moved <= FLOOR / 10 + 2 * servo.std
+        there &= np.abs(servo.position - reference) <= servo.floor
+        still = np.abs(velocity) <= FLOOR
+        return self.mode is Mode.RUNNING and bool(((there | ~known) & still).all())
 
-    def gated(self, stop: Array, time: Array) -> Self:
-        """Progress up to other times, of robots that may go on from another time.
+    def go_on_from(self, time: float) -> None:
+        """Go on from another time of the skill [s]."""
+        self.time, self.rest = time, replace(self.rest, time=time)
 
-        Parameters
-        ----------
-        stop : array of shape (B,)
-            Time beyond which robots do not go [s].
-        time : array of shape (B,)
-            From where they go on; NaN from where they are.
-        """
-        now, rest = (np.where(np.isfinite(time), time, x) for x in (self.time, self.rest_time))
-        return replace_fields(self, stop=stop, time=now, rest_time=rest)
-
-    def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
-        """Where references go: of robots that run, the wanted postures (B, n_joints).
+    def lead(self, wanted: Array, careful: bool) -> Array:
+        """Find where the reference goes: while the robot runs, to what is wanted.
 
         Parameters
         ----------
-        wanted : array of shape (B, n_joints)
-        careful : bool array of shape (B,)
-            Robots that hold an object.
+        wanted : array of shape (n_joints,)
+        careful : bool
+            Whether the robot holds an object.
         """
-        lead = np.where(careful, CAREFUL, 1.0)[:, None] * self._lead
+        probe = self.probe
+        probe.wanted = wanted
+        if self.mode is Mode.RUNNING:
+            return wanted
+        if self.mode is Mode.PROBING:
+            return probe.target
+        lead = (CAREFUL if careful else 1.0) * self._compute_lead()
         lead = np.maximum(lead, TELLING * self._motion_of_held)
-        lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
-        led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
-        goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
-        return replace_fields(self, wanted=wanted), goal
+        lead = np.where(probe.stuck, lead, 0.0)
+        return probe.target + np.clip(np.nan_to_num(wanted - probe.target), -lead, lead)
 
-    @property
-    def _lead(self) -> Array:
-        """Of the references of robots that are held (B, 1)."""
-        lead = self.servo.floor * (0.75 + self.since / PROBE_TIME)[:, None]
-        return np.minimum(lead, MOST_LEAD)
+    def _compute_lead(self) -> Array:
+        """Compute by how much the reference of a robot that is held leads (n_joints,)."""
+        share = 0.75 + self.timing.in_mode / PROBE_TIME
+        return np.minimum(self.servo.floor * share, MOST_LEAD)
 
     @property
     def _motion_of_held(self) -> Array:
-        """From which on joints (B, n_joints) that were held have moved, beside their noise."""
-        averaged = np.minimum(1.0, self.usual_dt / (2 * STANDSTILL))[:, None]
-        return self.servo.floor / 2 + 3 * np.sqrt(2 * self.servo.noise * averaged)
+        """From which on joints (n_joints,) that were held have moved, beside their noise."""
+        averaged = min(1.0, self.timing.usual_dt / (2 * STANDSTILL))
+        noise = self.servo.readings.noise
+        return self.servo.floor / 2 + 3 * np.sqrt(2 * noise * averaged)
 
-    # Running
+    # Time
 
-    def _timed(self, seen: Seen) -> Self:
-        """Time goes on for robots that follow."""
-        known = np.isfinite(seen.joints)
-        excess = np.where(known, self.servo.excess, 0.0).max(-1)
-        stands = seen.halted | (self.mode != RUNNING)
-        waits = self.clock.kind != "even"
-        lead = np.where(known, self.servo.lead, 0.0).max(-1)
-        if seen.obstructed is not None:
-            lead = np.maximum(lead, seen.obstructed)
-        rate = np.minimum(np.maximum(2 - waits * 2 * np.maximum(excess, lead), 0.0), 1.0)
-        if waits:
-            rate = np.minimum(rate, self.rate + seen.dt / RESTART)
-        rate = np.where(stands, seen.halted * self.rate, rate)
-        usual = np.where(self.usual_dt > 0, self.usual_dt, seen.dt)
-        usual = np.where(
-            seen.halted, self.usual_dt, usual + 0.1 * (np.minimum(seen.dt, 2 * usual) - usual)
-        )
-        owed = np.where(stands, 0.0, self.owed + seen.dt)
-        step = np.minimum(owed, CATCH_UP * np.where(usual > 0, usual, seen.dt))
-        owed = np.where(rate < 1, 0.0, owed - step)
-        step = np.where(stands, 0.0, self.clock.speed * rate * step)
-        time = self._arrived(self._until_end(step), known)
-        servo = self.servo
-        moved = np.where(known, np.abs(servo.reading - self.rest), 0.0)
-        left = (moved > MOTION / 2 + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
-        asked = servo.asked(self.rest_bank) - 6 * np.sqrt(servo.noise) - 2 * servo.floor
-        stalled = waits & ~stands & ~left & (np.where(known, asked, -1.0) > 0).any(-1)
-        off = ~stands & (excess > OFF) | stalled
-        now = np.array((servo.reading, servo.expected))
-        return replace_fields(
-            self,
-            time=time,
-            rate=rate,
-            owed=owed,
-            usual_dt=usual,
-            since=self.since + seen.dt,
-            off_for=np.where(off, self.off_for + seen.dt, 0.0),
-            followed=np.where((excess < 0.5)[:, None] & ~stands[:, None], now, self.followed),
-            rest=np.where(left[:, None], servo.reading, self.rest),
-            rest_bank=np.where(left[:, None], servo.second, self.rest_bank),
-            rest_time=np.where(left, time, self.rest_time),
-        )
+    def _advance_time(self, seen: Seen) -> None:
+        """Let time go on if the robot follows."""
+        known, judgement, timing = seen.is_known, self.servo.judgement, self.timing
+        excess = float(judgement.excess[known].max(initial=0.0))
+        lead = max(float(judgement.lead[known].max(initial=0.0)), seen.obstructed)
+        stands = seen.halted or self.mode is not Mode.RUNNING
+        rate = self._compute_rate(max(excess, lead), seen.dt)
+        step = timing.advance(seen.dt, seen.halted, stands, rate)
+        step = 0.0 if stands else self.clock.speed * rate * step
+        self.time = self._stop_at_arrival(self._limit_time(step), known)
+        left = self.mode is Mode.RUNNING and self._leave_rest(known)
+        if stands:
+            timing.off = 0.0
+            return
+        off = excess > OFF or (not left and self._stalls(known))
+        timing.off = timing.off + seen.dt if off else 0.0
+        if excess < 0.5:
+            self.followed = Comparison(self.servo.expected, self.servo.readings.median)
 
-    def _until_end(self, step: float | Array) -> Array:
-        """Time after a step; rounding does not cost a last one."""
+    def _compute_rate(self, gap: float, dt: float) -> float:
+        """Compute the rate of time by the largest gap, in units of what is usual."""
+        if self.clock.kind == "even":
+            return 1.0
+        return min(max(2 - 2 * gap, 0.0), 1.0, self.timing.rate + dt / RESTART)
+
+    def _limit_time(self, step: float) -> float:
+        """Compute the time after a step [s]; rounding does not cost a last one."""
         time = self.time + step
-        time = np.where(time > self.end - 1e-6 * np.asarray(step), self.end, time)
-        return np.minimum(time, self.stop)
+        time = self.end if time > self.end - 1e-6 * step else time
+        return time if self.stop is None else min(time, self.stop)
 
-    def _arrived(self, time: Array, known: Flags) -> Array:
-        """Times, at most the next arrival of robots that have not arrived."""
-        if not self.clock.arrivals:
+    def _stop_at_arrival(self, time: float, known: Flags) -> float:
+        """Limit time to the next arrival while some joint has not arrived."""
+        arrivals = self.clock.arrivals
+        following = bisect_left(arrivals, self.time)
+        if following == len(arrivals) or time <= arrivals[following]:
             return time
-        gap = np.where(known, self.servo.corrected - self.servo.first[0], 0.0)
-        stops = np.array([*self.clock.arrivals, np.inf])
-        return np.where(
-            (np.abs(gap) > self.servo.floor).any(-1),
-            np.minimum(time, stops[stops.searchsorted(self.time)]),
-            time,
-        )
+        gap = np.abs(self.servo.position - self.servo.bank.first[0])
+        late = bool((gap > self.servo.floor)[known].any())
+        return arrivals[following] if late else time
 
-    def _off(self, seen: Seen) -> Flags:
-        """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
-        off = self.servo.excess > OFF
-        probed = (self.mode == PROBING)[:, None] & self.stuck
-        off |= probed & (
-            np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, self.servo.floor / 2)
-        )
-        return np.isfinite(seen.joints) & off
+    def _leave_rest(self, known: Flags) -> bool:
+        """Notice that the robot has left where it was at rest."""
+        servo = self.servo
+        moved = np.abs(servo.readings.median - self.rest.reading) > MOTION / 2 + 3 * servo.std
+        left = bool(moved[known].any())
+        if left:
+            self._rest_here(self.time)
+        return left
+
+    def _rest_here(self, time: float) -> None:
+        """Let the rest of the robot be where it is now, at a time of the skill [s]."""
+        servo, resumed = self.servo, self.rest.resumed
+        self.rest = Rest(servo.readings.median, servo.bank.second, time, resumed)
+
+    def _stalls(self, known: Flags) -> bool:
+        """Tell whether joints were to move, however late they are, and none has."""
+        if self.clock.kind == "even":
+            return False
+        asked = self.servo.measure_asked(self.rest.bank) - 6 * self.servo.std
+        return bool((asked - 2 * self.servo.floor > 0)[known].any())
+
+    def _find_off(self, seen: Seen) -> Flags:
+        """Find joints that do not follow; while probing, those whose gaps have not closed."""
+        off, probe = self.servo.judgement.excess > OFF, self.probe
+        if self.mode is Mode.PROBING:
+            closed = np.maximum(0.5 * probe.opened, self.servo.floor / 2)
+            off = off | (probe.stuck & (np.abs(self.servo.gaps.mean) > closed))
+        return seen.is_known & off
 
     # From mode to mode
 
-    def _compared(self, seen: Seen) -> Self:
-        """Robots whose joints run along with their references: their gaps are offsets."""
-        servo, off = self.servo, self._off(seen)
-        asked = ((self.mode == PROBING) | (self.off_for > 0)) & ~seen.halted
-        lag = np.where(off, servo.lag, 0.0).max(-1)
-        long = np.where(self.mode == PROBING, self.since, self.off_for)
-        begins = asked & ~self.compared & (long > 1.5 * lag)
-        model = np.where(begins[:, None], servo.expected, self.model)
-        reading = np.where(begins[:, None], servo.reading, self.reading)
-        ran, moved = servo.reading - reading, servo.expected - model
-        tells = np.abs(moved) > MOTION + 3 * np.sqrt(servo.noise)
+    def _compare_motion(self, seen: Seen) -> bool:
+        """Take gaps of joints that run along with references for offsets; tell if any does."""
+        timing, servo, probing = self.timing, self.servo, self.mode is Mode.PROBING
+        if seen.halted or not (probing or timing.off > 0):
+            if self.mode is not Mode.HELD:
+                self.comparison = None
+            return False
+        off = self._find_off(seen)
+        if self.comparison is None:
+            long = timing.in_mode if probing else timing.off
+            if long > 1.5 * _longest_lag(servo, off):
+                self.comparison = Comparison(servo.expected, servo.readings.median)
+            return False
+        ran = servo.readings.median - self.comparison.reading
+        moved = servo.expected - self.comparison.expected
+        tells = np.abs(moved) > MOTION + 3 * servo.std
         along = off & tells & (np.abs(ran - moved) < 0.5 * np.abs(moved))
-        along &= (asked & self.compared)[:, None]
-        held = self.mode == HELD
-        return replace_fields(
-            self,
-            servo=servo.with_offsets(along) if along.any() else servo,
-            model=model,
-            reading=reading,
-            compared=(self.compared | begins) & (asked | held),
-            explained=along.any(-1),
-            displaced=self.displaced & ~along.any(-1),
-        )
+        if not along.any():
+            return False
+        servo.take_offsets(along)
+        self.probe.displaced = False
+        return True
 
-    def _noticed(self, reference: Array, seen: Seen, find: Find) -> Self:
-        """Robots that do not follow, and are probed."""
-        off = self._off(seen)
-        late = self.lasting | (seen.jumped & (off.sum(-1) > 0))
-        settled = self.since > RESTART + 4 * np.where(off, self.servo.lag, 0.0).max(-1)
-        rows = late & settled & (self.mode == RUNNING) & (self.time < self.end) & ~seen.halted
-        if not rows.any():
-            return self
-        servo, known = self.servo, np.isfinite(seen.joints)
-        asked = known & (servo.asked(self.rest_bank) > FLOOR)  # it stands
-        off = np.where(off.any(-1, keepdims=True), off, asked)
+    def _notice_stop(self, reference: Array, seen: Seen, find: Find) -> None:
+        """Probe a robot that does not follow."""
+        off, servo = self._find_off(seen), self.servo
+        late = self.lasting or (seen.jumped and bool(off.any()))
+        settled = self.timing.in_mode > RESTART + 4 * _longest_lag(servo, off)
+        if not (late and settled and self.time < self.end):
+            return
+        known = seen.is_known
+        if not off.any():  # it stands
+            off = known & (servo.measure_asked(self.rest.bank) > FLOOR)
         # what a joint that is slow or held does lies between rest and what its reference did
-        done, asked = servo.reading - self.followed[0], servo.expected - self.followed[1]
+        done = servo.readings.median - self.followed.reading
+        asked = servo.expected - self.followed.expected
         strange = done - np.clip(done, np.minimum(asked, 0), np.maximum(asked, 0))
-        moved = (off & (np.abs(strange) > 3 * MOTION)).any(-1)
-        several = moved & (off.sum(-1) > 1)
-        off |= moved[:, None] & known  # who was displaced is met in all joints
-        target = np.where(off, servo.corrected, reference)
-        new = self._switched(rows, PROBING, target)
-        new = replace_fields(
-            new,
-            stuck=np.where(rows[:, None], off, self.stuck),
-            opened=np.where(rows[:, None], np.abs(servo.gap), self.opened),
-            displaced=np.where(rows, moved, self.displaced),
-            placed=self.placed & ~rows,
-            compared=self.compared & ~rows,
-        )
-        return new._placed(rows & several, known, find)
+        moved = bool((off & (np.abs(strange) > 3 * MOTION)).any())
+        several = moved and off.sum() > 1
+        if moved:  # who was displaced is met in all joints
+            off = off | known
+        self._switch(Mode.PROBING, np.where(off, servo.position, reference))
+        probe = self.probe
+        probe.stuck, probe.opened = off, np.abs(servo.gaps.mean)
+        probe.displaced, probe.placed, self.comparison = moved, False, None
+        if several:
+            self._find_place(known, find)
 
-    def _probed(self, reference: Array, seen: Seen, find: Find) -> Self:
-        """Robots whose probe tells something."""
-        servo, probing = self.servo, (self.mode == PROBING) & ~seen.halted
-        if not probing.any():
-            return self
-        off, known = self._off(seen), np.isfinite(seen.joints)
-        lag = np.where(off, servo.lag, 0.0).max(-1)
-        stuck = known & self.stuck
-        near = np.where(stuck, np.abs(reference - self.target), 0.0).max(-1) < FLOOR / 10
-        way = np.where(stuck, np.abs(servo.corrected - self.target), 0.0)
-        moved = (way > MOTION + 3 * np.sqrt(servo.noise)).any(-1)
-        closed = probing & ~off.any(-1)
-        came = closed & (moved | self.explained)
-        arrived = probing & ~came & near & (closed | (self.since > DWELL + 4 * lag))
-        came |= closed & (self.since > PROBE_TIME)
-        new = self._switched(came | (arrived & self.placed), RUNNING, self.target)
-        held = arrived & ~self.placed
-        if not held.any():
-            return new
-        target = np.where(known, servo.corrected, reference)
-        new = replace_fields(
-            new._switched(held, HELD, target),
-            reading=np.where(held[:, None], servo.resting, new.reading),
-        )
-        new = new._placed(held & self.displaced, known, find)
-        return new._switched(held & new.placed, RUNNING, target)
+    def _end_probe(self, reference: Array, seen: Seen, find: Find, explained: bool) -> None:
+        """End a probe that tells something."""
+        servo, probe, known = self.servo, self.probe, seen.is_known
+        posture, resting, displaced = servo.position, servo.readings.resting, probe.displaced
+        came, arrived = self._judge_probe(reference, seen, explained)
+        if came or (arrived and probe.placed):
+            self._switch(Mode.RUNNING, probe.target)
+        if not arrived or probe.placed:
+            return
+        self._switch(Mode.HELD, np.where(known, posture, reference))
+        probe.held = resting
+        if self.comparison is not None:
+            self.comparison = replace(self.comparison, reading=resting)
+        if displaced and self._find_place(known, find):
+            self._switch(Mode.RUNNING, probe.target)
 
-    def _released(self, seen: Seen) -> Self:
-        """Robots that were held, and move again: what they missed is done then."""
-        stuck = np.isfinite(seen.joints) & self.stuck
-        now = np.array((self.servo.near_reading, self.servo.reading))
-        way = np.where(stuck, np.abs(now - self.reading).min(0), 0.0)
-        moved = (way > self._motion_of_held).any(-1)
+    def _judge_probe(self, reference: Array, seen: Seen, explained: bool) -> tuple[bool, bool]:
+        """Tell whether the robot came back, and whether its reference came to it instead."""
+        servo, probe, since = self.servo, self.probe, self.timing.in_mode
+        off, stuck = self._find_off(seen), seen.is_known & probe.stuck
+        near = bool((np.abs(reference - probe.target)[stuck] < FLOOR / 10).all())
+        if off.any():
+            return False, near and since > DWELL + 4 * _longest_lag(servo, off)
+        moved = np.abs(servo.position - probe.target) > MOTION + 3 * servo.std
+        came = explained or bool(moved[stuck].any())
+        return came or since > PROBE_TIME, near and not came
+
+    def _release(self, seen: Seen) -> None:
+        """Let a robot go on that was held, and moves again: what it missed is done then."""
+        readings, probe, rest = self.servo.readings, self.probe, self.rest
+        now = np.array((readings.near, readings.median))
+        way = np.abs(now - probe.held).min(0)
+        stuck = seen.is_known & probe.stuck
+        moved = bool((way > self._motion_of_held)[stuck].any())
         # as far as it is led it may stick: from where nothing more is wanted, time goes on
-        there = (~stuck | (np.abs(self.wanted - self.target) < self._lead)).all(-1)
-        rows = (self.mode == HELD) & (moved | there) & ~seen.halted
-        if not rows.any():
-            return self
-        back = rows & (self.time - self.rest_time > MISSED)
-        back &= (np.abs(self.rest_time - self.resumed) > NEARBY) & ~self.displaced
-        back &= self.clock.kind == "localizing"
-        new = self._switched(rows, RUNNING, self.target)
-        return replace_fields(
-            new,
-            time=np.where(back, self.rest_time, self.time),
-            resumed=np.where(back, self.rest_time, self.resumed),
-            relocalized=new.relocalized | back,
-        )
+        there = np.abs(probe.wanted - probe.target) < self._compute_lead()
+        if not (moved or there[stuck].all()):
+            return
+        back = self.clock.kind == "localizing" and not probe.displaced
+        back = back and self.time - rest.time > MISSED
+        back = back and (rest.resumed is None or abs(rest.time - rest.resumed) > NEARBY)
+        self._switch(Mode.RUNNING, probe.target)
+        if back:
+            self.time, self.relocalized = rest.time, True
+            self.rest = replace(self.rest, resumed=rest.time)
 
-    def _placed(self, rows: Flags, known: Flags, find: Find) -> Self:
-        """Robots that are at another place of the skill, and go on there."""
+    def _find_place(self, known: Flags, find: Find) -> bool:
+        """Find another place of the skill where a robot is, to go on there."""
         if self.clock.kind != "localizing":
-            return self
-        posture = np.where(known, self.servo.corrected, self.target)
-        found = {int(row): find(int(row), posture[row]) for row in np.flatnonzero(rows)}
-        time, placed, moved = self.time.copy(), self.placed.copy(), self.relocalized.copy()
-        for row, place in found.items():
-            if place is not None and abs(place - time[row]) > NEARBY:
-                time[row], placed[row], moved[row] = place, True, True
-        return replace_fields(
-            self,
-            time=time,
-            placed=placed,
-            relocalized=moved,
-            rest_time=np.where(moved, time, self.rest_time),
-        )
+            return False
+        place = find(np.where(known, self.servo.position, self.probe.target))
+        if place is None or abs(place - self.time) <= NEARBY:
+            return False
+        self.go_on_from(place)
+        self.probe.placed = self.relocalized = True
+        return True
 
-    def _switched(self, rows: Flags, mode: int, target: Array) -> Self:
-        """Some robots in another mode."""
-        if not rows.any():
-            return self
-        zero: Any = {
-            name: np.where(rows, 0.0, getattr(self, name))
-            for name in ("since", "off_for", "rate", "owed")
-        }
-        servo, rest, bank = self.servo, self.rest, self.rest_bank
-        if mode == RUNNING:
-            servo = servo.moving_on(np.broadcast_to(rows[:, None], self.target.shape))
-            if (self.displaced & rows).any():
-                servo = servo.put((self.displaced & rows)[:, None])
-            rest = np.where(rows[:, None], servo.reading, rest)
-            bank = np.where(rows[:, None], servo.second, bank)
-        return replace_fields(
-            self,
-            servo=servo,
-            rest=rest,
-            rest_bank=bank,
-            mode=np.where(rows, mode, self.mode),
-            target=np.where(rows[:, None], target, self.target),
-            displaced=self.displaced & ~(rows & (mode == RUNNING)),
-            **zero,
-        )
+    def _switch(self, mode: Mode, target: Array) -> None:
+        """Begin another mode."""
+        if mode is Mode.RUNNING:
+            self.servo.forget_motion(np.ones(target.shape, bool))
+            if self.probe.displaced:
+                self.servo.restart_here()
+            self._rest_here(self.rest.time)
+            self.probe.displaced = False
+        self.mode, self.probe.target = mode, target
+        self.timing.restart()
+
+
+def _longest_lag(servo: Servo, joints: Flags) -> float:
+    """Find the longest lag of some joints (n_joints,) [s]; 0 if there are none."""
+    return float(servo.lag[joints].max(initial=0.0))

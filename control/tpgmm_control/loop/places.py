@@ -61,7 +61,7 @@ class Places:
         like: Tensor,
         within: tuple[float, float] = (-math.inf, math.inf),
     ) -> float | None:
-        """The likeliest time that explains a robot's posture, or None.
+        """Find the likeliest time that explains a robot's posture, or None.
 
         Parameters
         ----------
@@ -77,35 +77,41 @@ class Places:
         within : tuple of float, optional
             Between which times it is looked for [s].
         """
-        one, grid = self._robot(row, posture, holding, like), self.grid
+        one, grid = self._take_robot(row, posture, holding, like), self.grid
         grid = grid[(grid >= within[0]) & (grid <= within[1])]
         if one is None or not len(grid):
             return None
-        likelihood = one.log_likelihood(grid)
+        likelihood = one.compute_log_likelihood(grid)
         apart = grid - now
         distance = np.maximum(2 * apart, -apart)
-        there = one.modes(grid, likelihood - distance / DISTANCE, int(np.abs(apart).argmin()))
+        there = one.find_modes(
+            grid, likelihood - distance / DISTANCE, int(np.abs(apart).argmin())
+        )
         if not there:
             return None
         alike = [k for k in there if likelihood[k] > likelihood[there].max() - ALIKE]
         return float(grid[min(alike, key=lambda k: distance[k])])
 
-    def first(self, row: int, holding: Holding, like: Tensor) -> float:
-        """Where a robot starts that may stand anywhere: the earliest of the best places."""
-        one = self._robot(row, as_array(like).reshape(-1, like.shape[-1])[row], holding, like)
+    def find_start(self, row: int, holding: Holding, like: Tensor) -> float:
+        """Find where a robot starts that may stand anywhere: the first of the best places."""
+        one = self._take_robot(
+            row, as_array(like).reshape(-1, like.shape[-1])[row], holding, like
+        )
         if one is None:
             return self.begin
         grid = self.grid
-        likelihood = one.log_likelihood(grid)
+        likelihood = one.compute_log_likelihood(grid)
         # of several, as in a repeating motion, the earliest: others leave something out; but
         # the first half second is left out only where the beginning explains nothing
-        there = one.modes(grid, likelihood, 0)
+        there = one.find_modes(grid, likelihood, 0)
         alike = [k for k in there if likelihood[k] > likelihood[there].max() - ALIKE]
         early = 0 in there and grid[min(alike)] - self.begin < 0.5
         return self.begin if early or not there else float(grid[min(alike)])
 
-    def _robot(self, row: int, posture: Array, holding: Holding, like: Tensor) -> _Robot | None:
-        """One robot of the batch, as it is observed; None if nothing of it is."""
+    def _take_robot(
+        self, row: int, posture: Array, holding: Holding, like: Tensor
+    ) -> _Robot | None:
+        """Take one robot of the batch, as it is observed; None if nothing of it is."""
         batch, kinematics = like.shape[:-1], self.skill.kinematics
         index = tuple(int(k) for k in np.unravel_index(row, batch)) if batch else ()
         with torch.inference_mode():
@@ -133,23 +139,23 @@ class _Robot:
     state: RobotState
     frames: Mapping[str, Frame]
 
-    def log_likelihood(self, grid: Array) -> Array:
-        """Of the times (G,)."""
+    def compute_log_likelihood(self, grid: Array) -> Array:
+        """Compute how likely the robot is at times (G,)."""
         with torch.inference_mode():
             times = torch.from_numpy(grid)
             return as_array(self.skill.log_likelihood(times, self.state, self.frames))[0]
 
-    def modes(self, grid: Array, score: Array, first: int) -> list[int]:
-        """One time and the highest modes of a score that explain the posture, as indices."""
+    def find_modes(self, grid: Array, score: Array, first: int) -> list[int]:
+        """Find one time and the highest modes of a score that explain the posture."""
         found = [first]
         for _ in range(TRIED):
             found.append(int(score.argmax()))
             near = np.abs(grid - grid[found[-1]]) <= NEARBY
             score = np.where(near, -np.inf, score)
-        return [k for k in dict.fromkeys(found) if self.explained(float(grid[k]))]
+        return [k for k in dict.fromkeys(found) if self.explains(float(grid[k]))]
 
-    def explained(self, place: float) -> bool:
-        """Whether it is near the skill's reference at that time."""
+    def explains(self, place: float) -> bool:
+        """Tell whether the robot is near the skill's reference at a time."""
         with torch.inference_mode():
             time = torch.as_tensor(place).to(self.state.joints)
             estimate = self.skill.estimate(time, self.state, self.frames)

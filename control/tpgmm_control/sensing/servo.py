@@ -18,18 +18,18 @@ learned while gaps are usual and the joint moves, offsets while gaps are usual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.arrays import Array
 
 Flags = NDArray[np.bool_]
 #: Lags of position servos, from stiff industrial drives to soft hobby servos [s].
-LAGS = np.geomspace(0.01, 0.64, 7)[:, None, None]
+LAGS = np.geomspace(0.01, 0.64, 7)[:, None]
 #: A gap that means nothing: friction, backlash, compliance [rad or m].
 FLOOR = 0.02
 #: Share of the servo's own gap by which the model of its lag may be wrong.
@@ -45,240 +45,332 @@ POSSIBLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Servo:
-    """Lags, offsets and unexplained gaps of the joints of B robots; immutable.
+class LagBank:
+    """Simulated servos of each lag, and how likely each lag is.
 
     Parameters
     ----------
-    first, second : array of shape (K, B, n_joints)
-        The bank: servos of each lag, of first and of second order.
-    slow : array of shape (K, B, n_joints)
+    first, second : array of shape (K, n_joints)
+        Positions of servos of first and of second order [rad or m].
+    slow : array of shape (K, n_joints)
         Low pass of ``second``: motion is what is beside it.
-    slow_reading, near_reading : array of shape (B, n_joints)
-        The same of the readings, and with a shorter time: a joint that is there stands.
-    score : array of shape (K, B, n_joints)
+    score : array of shape (K, n_joints)
         Logarithm of the likelihood of the lags, up to a constant.
-    readings : array of shape (3, B, n_joints)
-        The last ones.
-    gaps : array of shape (3, K, B, n_joints)
-        The same less the positions of the bank; NaN before the first.
-    reading : array of shape (B, n_joints)
-        Their median: without single outliers.
-    noise : array of shape (B, n_joints)
-        Variance of the readings.
-    offset, variance : array of shape (B, n_joints)
-        Estimate of the offset, and its variance.
-    each, gap : arrays of shape (K, B, n_joints) and (B, n_joints)
-        What each lag and the offset do not explain, smoothed over half a lag; their mean.
-    expected, lag : array of shape (B, n_joints)
-        Expected position without offset, mean of the lag [s].
-    floor : array of shape (B, n_joints)
-        Half the gap that means nothing: friction, backlash, what contact is known to leave.
-    usual : array of shape (B, n_joints)
-        Size that gaps usually have at most.
-    excess : array of shape (B, n_joints)
-        Distance from what some possible lag explains, in units of what is usual: at 1 a joint
-        does not follow.
-    lead : array of shape (B, n_joints)
-        Size of the gap for the shortest lag that is possible, in units of what is usual then:
-        how far the reference leads.
+    weight : array of shape (K, n_joints)
+        Posterior of the lags.
     """
 
     first: Array
     second: Array
     slow: Array
-    slow_reading: Array
-    near_reading: Array
     score: Array
-    readings: Array
-    gaps: Array
-    reading: Array
-    noise: Array
-    offset: Array
-    variance: Array
-    each: Array
-    gap: Array
-    expected: Array
-    lag: Array
-    floor: Array
-    usual: Array
-    excess: Array
-    lead: Array
+    weight: Array
 
     @classmethod
-    def at_rest(cls, posture: Array) -> Self:
-        """Robots that stand at their references (B, n_joints)."""
-        bank = np.broadcast_to(posture, (len(LAGS), *posture.shape))
-        zero, one = np.zeros_like(posture), np.ones_like(posture)
-        none = np.full((3, *bank.shape), np.nan)
-        return cls(
-            bank, bank, bank, posture, posture, np.zeros(bank.shape),
-            none[:, 0], none, posture, 1e-6 * one, zero,
-            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, FLOOR * one,
-            one, zero, zero,
-        )  # fmt: skip
+    def start(cls, posture: Array, score: Array) -> Self:
+        """Begin at rest in a posture (n_joints,)."""
+        bank = np.broadcast_to(posture, score.shape)
+        return cls(bank, bank, bank, score, _compute_weight(score))
 
-    @property
-    def corrected(self) -> Array:
-        """Where the joints are: readings less offsets."""
-        return self.reading - self.offset
+    def advance(self, reference: Array, dt: float) -> Self:
+        """Let the servos run towards a reference (n_joints,) for a time [s]."""
+        moved = 2 * dt / LAGS
+        left, behind = np.exp(-moved), self.first - reference
+        second = reference + left * (self.second - reference + moved * behind)
+        slow = self.slow + (1 - np.exp(-dt / WASH_OUT)) * (second - self.slow)
+        return replace(self, first=reference + left * behind, second=second, slow=slow)
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Measurements of the joints.
+
+    Parameters
+    ----------
+    last : array of shape (3, n_joints)
+        The last ones [rad or m].
+    median : array of shape (n_joints,)
+        Their median: without single outliers.
+    slow, near : array of shape (n_joints,)
+        Low passes, a long one beside which there is motion, and a short one: a joint that is
+        there stands.
+    noise : array of shape (n_joints,)
+        Variance.
+    """
+
+    last: Array
+    median: Array
+    slow: Array
+    near: Array
+    noise: Array
 
     @property
     def resting(self) -> Array:
         """Readings of joints that stand, averaged; of those that move, as they are."""
-        stands = np.abs(self.reading - self.near_reading) <= 3 * np.sqrt(self.noise)
-        return np.where(stands, self.near_reading, self.reading)
+        stands = np.abs(self.median - self.near) <= 3 * np.sqrt(self.noise)
+        return np.where(stands, self.near, self.median)
+
+    def advance(self, reading: Array, dt: float, noise: Array) -> Self:
+        """Take in a reading (n_joints,), a time [s] after the last."""
+        last = np.concatenate((self.last[1:], reading[None]))
+        wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
+        slow = self.slow + wash * (reading - self.slow)
+        near = self.near + soon * (reading - self.near)
+        return type(self)(last, _take_median(last), slow, near, noise)
+
+    def jump(self, reading: Array, shift: Array) -> Self:
+        """Begin again at a reading (n_joints,); the way there (n_joints,) is no motion."""
+        last = np.broadcast_to(reading, self.last.shape)
+        return replace(self, last=last, slow=self.slow + shift, near=self.near + shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Offset:
+    """Sag, payload, slipped encoders: what readings exceed positions by.
+
+    Parameters
+    ----------
+    mean, variance : array of shape (n_joints,)
+        Estimate [rad or m], and its variance.
+    """
+
+    mean: Array
+    variance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """What lags and the offset do not explain.
+
+    Parameters
+    ----------
+    last : array of shape (3, K, n_joints), optional
+        The last readings less the positions of the bank; None before the first reading.
+    each : array of shape (K, n_joints)
+        The gap beside each lag, smoothed over half a lag [rad or m].
+    mean : array of shape (n_joints,)
+        Their mean.
+    """
+
+    last: Array | None
+    each: Array
+    mean: Array
+
+    def less(self, step: Array) -> Self:
+        """Return the gaps without a part (n_joints,) that is explained."""
+        return replace(self, each=self.each - step, mean=self.mean - step)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """How unusual the gaps are.
+
+    Parameters
+    ----------
+    usual : array of shape (n_joints,)
+        Size that gaps usually have at most [rad or m].
+    excess : array of shape (n_joints,)
+        Distance from what some possible lag explains, in units of what is usual: at 1 a joint
+        does not follow.
+    lead : array of shape (n_joints,)
+        Size of the gap for the shortest lag that is possible, in units of what is usual then:
+        how far the reference leads.
+    """
+
+    usual: Array
+    excess: Array
+    lead: Array
+
+
+@dataclass(eq=False)
+class Servo:
+    """Model of the servos of one robot; made by :meth:`start`, changed by each tick.
+
+    Its parts are replaced, never changed, so that a copy is cheap.
+
+    Parameters
+    ----------
+    bank : LagBank
+    readings : Readings
+    offset : Offset
+    gaps : Gaps
+    judgement : Judgement
+    expected, lag : array of shape (n_joints,)
+        Expected positions without offsets [rad or m], and means of the lags [s].
+    floor : array of shape (n_joints,)
+        Half the gap that means nothing: friction, backlash, what contact is known to leave.
+    """
+
+    bank: LagBank
+    readings: Readings
+    offset: Offset
+    gaps: Gaps
+    judgement: Judgement
+    expected: Array
+    lag: Array
+    floor: Array
+
+    @classmethod
+    def start(cls, posture: Array) -> Self:
+        """Begin at rest at a reference (n_joints,)."""
+        zero, one = np.zeros_like(posture), np.ones_like(posture)
+        none = np.zeros((len(LAGS), *posture.shape))
+        last = np.broadcast_to(posture, (3, *posture.shape))
+        return cls(
+            LagBank.start(posture, none),
+            Readings(last, posture, posture, posture, 1e-6 * one),
+            Offset(zero, 16 * OFFSET_STD**2 * one),
+            Gaps(None, none, zero),
+            Judgement(one, zero, zero),
+            posture,
+            LAGS.mean() * one,
+            FLOOR * one,
+        )
+
+    def copy(self) -> Self:
+        """Copy the model as it is now."""
+        return copy.copy(self)
 
     @property
-    def weight(self) -> Array:
-        """Posterior of the lags (K, B, n_joints); the robot's other joints are a prior."""
-        alone = np.exp(self.score)
-        alone /= alone.sum(0)
-        weight: Array = alone * alone.sum(-1, keepdims=True)
-        return weight / weight.sum(0)
+    def position(self) -> Array:
+        """Positions of the joints (n_joints,): readings less offsets."""
+        return self.readings.median - self.offset.mean
 
-    def update(
-        self, reference: Array, reading: Array, dt: Array, jumped: Flags, learns: Flags
-    ) -> Self:
-        """The model after a tick.
+    @property
+    def std(self) -> Array:
+        """Standard deviations of the readings (n_joints,)."""
+        return np.sqrt(self.readings.noise)
+
+    def measure_asked(self, bank: Array) -> Array:
+        """Measure how far joints of any lag were to move since ``bank.second`` was that."""
+        return np.abs(self.bank.second - bank).min(0)
+
+    def advance(
+        self, reference: Array, reading: Array, dt: float, jumped: bool, learns: bool
+    ) -> None:
+        """Take in what was measured at a tick.
 
         Parameters
         ----------
-        reference : array of shape (B, n_joints)
+        reference : array of shape (n_joints,)
             What was sent a tick ago.
-        reading : array of shape (B, n_joints)
+        reading : array of shape (n_joints,)
             What is measured now; NaN where nothing is.
-        dt : array of shape (B, 1)
+        dt : float
             Duration of the tick [s].
-        jumped : bool array of shape (B, 1)
-            Robots whose readings have jumped: what was before does not smooth them.
-        learns : bool array of shape (B, 1)
-            Robots whose motion teaches lags and offsets.
+        jumped : bool
+            Whether readings have jumped: what was before does not smooth them.
+        learns : bool
+            Whether motion teaches lags and offsets.
         """
-        moved = 2 * dt / LAGS
-        left, behind = np.exp(-moved), self.first - reference
-        second = reference + left * (self.second - reference + moved * behind)
-        weight = self.weight
-        expected = (weight * second).sum(0)
-        known = np.isfinite(reading)
-        y = np.where(known, reading, expected + self.offset + self.gap)
-        readings = np.concatenate((self.readings[1:], y[None]))
-        gaps = np.concatenate((self.gaps[1:], (y - second)[None]))
-        jumped = jumped | np.isnan(gaps[1, 0])
-        slow, near = self.slow_reading, self.near_reading
-        if jumped.any():
-            gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
-            shift = np.where(jumped, y - expected - self.offset - self.gap, 0.0)  # is no motion
-            slow, near = slow + shift, near + shift
-        bend = (weight * (gaps[2] - 2 * gaps[1] + gaps[0])).sum(0) ** 2 / 6
-        bend = np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
-        noise = self.noise + np.minimum(dt / WASH_OUT, 1) * known * bend
-        lag = (weight * LAGS).sum(0)
+        before, weight = self.bank, self.bank.weight
+        self.bank = bank = before.advance(reference, dt)
+        self.expected, self.lag = (weight * bank.second).sum(0), (weight * LAGS).sum(0)
+        known, offset, gap = np.isfinite(reading), self.offset.mean, self.gaps.mean
+        y = np.where(known, reading, self.expected + offset + gap)
+        if jumped or self.gaps.last is None:
+            jumped = True
+            self.readings = self.readings.jump(y, y - self.expected - offset - gap)
+            last = np.broadcast_to(y - bank.second, (3, *bank.second.shape))
+        else:
+            last = np.concatenate((self.gaps.last[1:], (y - bank.second)[None]))
+        slow, noise = self.readings.slow, self._estimate_noise(last, weight, known, dt)
         # readings without noise need no smoothing, which would be late
         noisy = np.minimum(3 * np.sqrt(noise) / FLOOR, 1.0)
-        smooth = np.maximum(0.5 * lag * noisy, dt / 4)
-        share = np.where(jumped, 1.0, 1 - np.exp(-dt / smooth))
-        each = self.each + share * (_median(gaps) - self.offset - self.each)
+        smooth = np.maximum(0.5 * self.lag * noisy, dt / 4)
+        share = 1.0 if jumped else 1 - np.exp(-dt / smooth)
+        each = self.gaps.each + share * (_take_median(last) - offset - self.gaps.each)
         each = np.where(known, each, 0.0)
-        wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
-        new = replace_fields(
-            self,
-            first=reference + left * behind,
-            second=second,
-            slow=self.slow + wash * (second - self.slow),
-            slow_reading=slow + wash * (y - slow),
-            near_reading=near + soon * (y - near),
-            readings=readings,
-            gaps=gaps,
-            reading=_median(readings),
-            noise=noise,
-            each=each,
-            gap=(weight * each).sum(0),
-            expected=expected,
-            lag=lag,
-        )
-        noise = noise * np.minimum(1.0, dt / (2 * smooth))
-        new = new._judged(reference, weight, noise)
-        motion, ran = self.second - self.slow, new.reading - slow  # medians are a tick late
-        return new._learned(reference, motion, ran, dt, known & learns)
+        self.gaps = Gaps(last, each, (weight * each).sum(0))
+        self.readings = self.readings.advance(y, dt, noise)
+        self._judge(reference, weight, noise * np.minimum(1.0, dt / (2 * smooth)))
+        learning = known & learns & (self.judgement.excess < 1)
+        motion, ran = before.second - before.slow, self.readings.median - slow
+        self._learn_lags(motion, ran, dt, learning)  # medians are a tick late
+        self._learn_offsets(reference, dt, learning)
 
-    def _judged(self, reference: Array, weight: Array, noise: Array) -> Self:
-        """How large the gaps are, beside their noise and what is not known."""
+    def _estimate_noise(self, gaps: Array, weight: Array, known: Flags, dt: float) -> Array:
+        """Estimate the variance of readings from how the last three gaps bend."""
+        noise = self.readings.noise
+        bend = (weight * (gaps[2] - 2 * gaps[1] + gaps[0])).sum(0) ** 2 / 6
+        bend = np.minimum(bend, 9 * noise + 1e-6) - noise
+        return noise + min(dt / WASH_OUT, 1.0) * known * bend
+
+    def _judge(self, reference: Array, weight: Array, noise: Array) -> None:
+        """Judge how large the gaps are, beside their noise and what is not known."""
+        offset, each = self.offset, self.gaps.each
         # a part of an offset may be friction, which changes sides where a joint turns back
-        floor = 2 * self.floor + np.minimum(np.abs(self.offset), FLOOR)
-        floor = floor + 2 * np.sqrt(noise + self.variance)
+        floor = 2 * self.floor + np.minimum(np.abs(offset.mean), FLOOR)
+        floor = floor + 2 * np.sqrt(noise + offset.variance)
         usual = floor + MODEL_ERROR * np.abs(reference - self.expected)
         possible = weight > POSSIBLE * weight.max(0)
-        least = np.where(possible, self.each, np.inf).min(0)
-        most = np.where(possible, self.each, -np.inf).max(0)
+        least = each.min(0, where=possible, initial=np.inf)
+        most = each.max(0, where=possible, initial=-np.inf)
         beyond = np.maximum(np.maximum(least, -most), 0.0)
-        shortest = possible.argmax(0)
-        own = np.abs(reference - shortest.choose(self.second))
-        lead = np.abs(shortest.choose(self.each)) / (floor + MODEL_ERROR * own)
-        return replace_fields(self, usual=usual, excess=beyond / usual, lead=lead)
+        shortest = (possible.argmax(0), np.arange(len(reference)))
+        own = np.abs(reference - self.bank.second[shortest])
+        lead = np.abs(each[shortest]) / (floor + MODEL_ERROR * own)
+        self.judgement = Judgement(usual, beyond / usual, lead)
 
-    def _learned(
-        self, reference: Array, motion: Array, ran: Array, dt: Array, learns: Flags
-    ) -> Self:
-        """Lags and offsets of joints whose gaps are usual."""
-        learns = learns & (self.excess < 1)
-        # lags: from motion beside the slow one, in which offsets are gone, of joints that have
-        # been asked to move lately, have moved, and do so now
+    def _learn_lags(self, motion: Array, ran: Array, dt: float, learns: Flags) -> None:
+        """Learn lags from motion beside the slow one, in which offsets are gone.
+
+        Joints teach that have been asked to move lately, have moved, and do so now.
+        """
+        bank, noise = self.bank, self.readings.noise
         mean = motion.sum(0) / len(LAGS)
         moves = learns & (np.abs(mean) > FLOOR) & (np.abs(ran) > FLOOR / 2)
-        now = np.abs(self.reading - self.near_reading)
-        moves &= now > FLOOR / 10 + 0.5 * np.sqrt(self.noise)
-        score = self.score
+        now = np.abs(self.readings.median - self.readings.near)
+        moves &= now > FLOOR / 10 + 0.5 * self.std
         if moves.any():
-            variance = (SERVO_STD / 2) ** 2 + self.noise + (0.1 * mean) ** 2
+            variance = (SERVO_STD / 2) ** 2 + noise + (0.1 * mean) ** 2
             error = np.minimum((ran - motion) ** 2 / (2 * variance), 8.0)
-            score = score - moves * (dt / np.maximum(2 * self.lag, dt)) * error
+            score = bank.score - moves * (dt / np.maximum(2 * self.lag, dt)) * error
             score = np.maximum(score - score.max(0), -10.0)
-        # offsets: a Kalman filter to which the servo's own motion is noise
+            self.bank = replace(bank, score=score, weight=_compute_weight(score))
+
+    def _learn_offsets(self, reference: Array, dt: float, learns: Flags) -> None:
+        """Learn offsets by a Kalman filter to which the servo's own motion is noise."""
         own = (MODEL_ERROR * (reference - self.expected)) ** 2
-        noise = (SERVO_STD**2 + self.noise + own) * self.lag
-        before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
+        noise = (SERVO_STD**2 + self.readings.noise + own) * self.lag
+        before = np.minimum(self.offset.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
         gain = learns * before * dt / (before * dt + noise)
-        step = gain * self.gap
-        return replace_fields(
-            self,
-            score=score,
-            offset=self.offset + step,
-            each=self.each - step,
-            gap=self.gap - step,
-            variance=(1 - gain) * before,
-        )
+        step = gain * self.gaps.mean
+        self.offset = Offset(self.offset.mean + step, (1 - gain) * before)
+        self.gaps = self.gaps.less(step)
 
-    def with_offsets(self, joints: Flags) -> Self:
-        """The gaps of some joints (B, n_joints) are offsets."""
-        return replace_fields(
-            self.moving_on(joints),
-            offset=np.where(joints, self.offset + self.gap, self.offset),
-            each=np.where(joints, self.each - self.gap, self.each),
-            gap=np.where(joints, 0.0, self.gap),
-            variance=np.where(joints, FLOOR**2, self.variance),
-        )
+    def take_offsets(self, joints: Flags) -> None:
+        """Take the gaps of some joints (n_joints,) for offsets."""
+        self.forget_motion(joints)
+        step = np.where(joints, self.gaps.mean, 0.0)
+        variance = np.where(joints, FLOOR**2, self.offset.variance)
+        self.offset = Offset(self.offset.mean + step, variance)
+        self.gaps = self.gaps.less(step)
 
-    def asked(self, bank: Array) -> Array:
-        """How far joints of any lag have been asked to move since ``second`` was this bank."""
-        return np.abs(self.second - bank).min(0)
+    def forget_motion(self, joints: Flags) -> None:
+        """Let the motion of some joints (n_joints,) teach from now on, not what was before."""
+        motion = (self.bank.weight * (self.bank.second - self.bank.slow)).sum(0)
+        slow = np.where(joints, self.readings.median - motion, self.readings.slow)
+        self.readings = replace(self.readings, slow=slow)
 
-    def put(self, robots: Flags) -> Self:
-        """Some robots (B, 1) were put to where they are."""
-        here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
-        here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
-        here |= {"gaps": self.offset, "each": 0 * self.gap, "gap": 0 * self.gap}
-        return replace_fields(
-            self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
-        )
-
-    def moving_on(self, joints: Flags) -> Self:
-        """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
-        motion = (self.weight * (self.second - self.slow)).sum(0)
-        slow = np.where(joints, self.reading - motion, self.slow_reading)
-        return replace_fields(self, slow_reading=slow)
+    def restart_here(self) -> None:
+        """Let references begin where the robot was put to."""
+        here, reading, score = self.position, self.readings.median, self.bank.score
+        last = np.broadcast_to(self.offset.mean, (3, *score.shape))
+        self.bank = LagBank.start(here, score)
+        self.readings = replace(self.readings, slow=reading, near=reading)
+        self.gaps = Gaps(last, np.zeros(score.shape), np.zeros_like(here))
+        self.expected = here
 
 
-def _median(three: Array) -> Array:
+def _compute_weight(score: Array) -> Array:
+    """Compute the posterior of the lags (K, n_joints); a joint's others are its prior."""
+    alone = np.exp(score)
+    alone /= alone.sum(0)
+    weight: Array = alone * alone.sum(-1, keepdims=True)
+    return weight / weight.sum(0)
+
+
+def _take_median(three: Array) -> Array:
     low, high = np.minimum(three[0], three[1]), np.maximum(three[0], three[1])
     return np.maximum(low, np.minimum(high, three[2]))
