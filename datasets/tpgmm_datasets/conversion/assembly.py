@@ -203,7 +203,7 @@ class Assembly:
         if self.commands is None:
             return None
         stored = rows.values[self.commands.actions.feature.key]
-        commands, kind = self.commands.explain(stored, joints, self.joints.names)
+        commands, kind = self.commands.read(stored, joints, self.joints.names)
         if kind:
             self.left_out.append((rows.episode.index, kind))
         return None if commands is None else torch.from_numpy(commands)

@@ -80,10 +80,10 @@ class CommandColumns:
         actions = replace(joints, feature=sent, names=None, units=tuple(units))
         return cls(actions, tuple(found.get(joint) for joint in range(measured.width)))
 
-    def read(self, stored: Array, joints: Array, names: Sequence[str] | None) -> Array:
-        """Convert actions to commands of all joints (T, n_joints) [rad or m].
-
-        Joints without commands, and parts of a quaternion, stay as they were measured.
+    def read(
+        self, stored: Array, joints: Array, names: Sequence[str] | None
+    ) -> tuple[Array | None, str]:
+        """Convert actions to commands of all joints; those without stay as they were measured.
 
         Parameters
         ----------
@@ -94,36 +94,47 @@ class CommandColumns:
         names : sequence of str or None
             Names of the joints.
 
-        Raises
-        ------
-        DatasetError
-            If their unit is not known.
-        """
-        values, commands = self.actions.values(stored), joints.copy()
-        kept = {i for group in quaternion_groups(names) for i in group}
-        for joint, column in enumerate(self.columns):
-            if column is not None and joint not in kept:
-                commands[:, joint] = values[:, column]
-        return commands
-
-    def explain(
-        self, stored: Array, joints: Array, names: Sequence[str] | None
-    ) -> tuple[Array | None, str]:
-        """Return commands (T, n_joints), or else what actions are that are no postures.
-
-        Parameters
-        ----------
-        stored, joints, names
-            As for :meth:`read`.
+        Returns
+        -------
+        As of :func:`keep_postures`.
         """
         if all(column is None for column in self.columns):
             return None, OTHERS
         try:
-            commands = self.read(stored, joints, names)
-        except DatasetError:  # values that cannot be in the unit of the joints
+            values = self.actions.values(stored)
+        except DatasetError:  # that cannot be in the unit of the joints
             return None, SCALED
-        kind = classify_commands(commands, joints)
-        return (None if kind else commands), kind
+        commands = joints.copy()
+        for joint, column in enumerate(self.columns):
+            if column is not None:
+                commands[:, joint] = values[:, column]
+        return keep_postures(commands, joints, names)
+
+
+def keep_postures(
+    commands: Array, joints: Array, names: Sequence[str] | None
+) -> tuple[Array | None, str]:
+    """Keep commands where they are postures; the parts of quaternions stay as measured.
+
+    Parameters
+    ----------
+    commands, joints : array of shape (T, n_joints)
+        In radians or metres.
+    names : sequence of str or None
+        Names of the joints.
+
+    Returns
+    -------
+    commands : array of shape (T, n_joints), or None
+        In radians or metres.
+    kind : str
+        What they are, where they are left out.
+    """
+    turns = [i for group in quaternion_groups(names) for i in group]
+    kept = commands.copy()
+    kept[:, turns] = joints[:, turns]
+    kind = classify_commands(kept, joints)
+    return (None if kind else kept), kind
 
 
 def _match_values(measured: Feature, sent: Feature) -> dict[int, int]:

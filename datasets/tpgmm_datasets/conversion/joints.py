@@ -26,7 +26,7 @@ COMMANDED = ("action", "actions")
 JOINT_FEATURES = (*MEASURED, *COMMANDED)
 #: What releases before 0.4 took for ``joints``; it changes nothing.
 OLD_WORDS = ("measured", "commanded")
-LEARNED_BESIDE = "joints='commanded' can go: commands are learned beside measured joints now"
+LEARNED_BESIDE = "can go: commands are learned beside measured joints now"
 #: Parts of the names of features that may hold measured joints.
 LIKE_JOINTS = re.compile("joint|qpos|proprio|state|position", re.IGNORECASE)
 
@@ -106,7 +106,8 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
             file="meta/info.json",
         )
     if joints == "commanded" and key in MEASURED:
-        warnings.warn(LEARNED_BESIDE, DatasetWarning, stacklevel=2)
+        said = f"joints='commanded' (--joints) {LEARNED_BESIDE}"
+        warnings.warn(said, DatasetWarning, stacklevel=2)
     return key
 
 
