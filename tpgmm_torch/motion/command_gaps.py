@@ -139,9 +139,8 @@ class CommandGaps:
             name, be, sag = joint_names[joints[0]], "is", "sags"
             if len(joints) > 1:
                 name, be, sag = f"{called}s", "are", "sag"
-            far = (
-                f"{max(most[joints]):.2g} {'m' if joint_names[joints[0]] in lengths else 'rad'}"
-            )
+            unit = "m" if joint_names[joints[0]] in lengths else "rad"
+            far = f"{round(max(most[joints]), 2):g} {unit}"
             said.append(
                 f"{name} {sag} {far}" if sags else f"{name} {be} commanded {far} beyond"
             )

@@ -258,7 +258,7 @@ class Learner:
         ]
 
     def _make_demonstration(self, columns: Mapping[str, Tensor]) -> tuple[Demonstration, str]:
-        """Make a demonstration of the columns of an episode; and say which actions do not fit."""
+        """Make a demonstration of an episode; and say what actions are, if no postures."""
         rows = {key: column.to(self._joints.scale.device) for key, column in columns.items()}
         joints = self._joints.joints(rows[OBS_STATE]).cpu()
         actions = self._joints.decode_action(rows[ACTION]).cpu()
