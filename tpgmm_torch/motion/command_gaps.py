@@ -26,8 +26,6 @@ from torch import Tensor
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 
-__all__ = ["CommandGaps"]
-
 #: Instants of a skill at which gaps are known.
 INSTANTS = 200
 #: Width by which gaps are smoothed [s].

@@ -195,7 +195,7 @@ class Assembly:
 
     @cached_property
     def commands(self) -> CommandColumns | None:
-        """Where the commands of the joints are; None where the set has none."""
+        """Find where the commands of the joints are; None where the set has none."""
         return CommandColumns.find(self.layout, self.joints)
 
     def _read_commands(self, rows: EpisodeRows, joints: Array) -> Tensor | None:
