@@ -104,7 +104,7 @@ class CommandGaps:
         )
         return gap, extent
 
-    def describe(self, joint_names: Sequence[str], lengths: Collection[str] = ()) -> str:
+    def describe(self, joint_names: Sequence[str], lengths: Collection[int] = ()) -> str:
         """Say in a sentence what was learned, the largest gaps first.
 
         A joint whose gap comes and goes meets something, as a gripper does; one that always
@@ -114,8 +114,8 @@ class CommandGaps:
         ----------
         joint_names : sequence of str
             Names of the joints, in their order.
-        lengths : collection of str
-            Those of them that are in metres.
+        lengths : collection of int
+            Numbers of those that are in metres.
 
         Examples
         --------
@@ -137,7 +137,7 @@ class CommandGaps:
             name, be, sag = joint_names[joints[0]], "is", "sags"
             if len(joints) > 1:
                 name, be, sag = f"{called}s", "are", "sag"
-            unit = "m" if joint_names[joints[0]] in lengths else "rad"
+            unit = "m" if joints[0] in lengths else "rad"
             far = f"{round(max(most[joints]), 2):g} {unit}"
             said.append(
                 f"{name} {sag} {far}" if sags else f"{name} {be} commanded {far} beyond"

@@ -61,7 +61,7 @@ def test_a_sentence_says_what_was_learned():
     names = ["left_lift", "left_gripper", "gripper_r", "lift_right"]
     said = "grippers are commanded 0.4 rad beyond; lifts sag 0.05 rad"
     assert both.describe(names) == said
-    assert "lifts sag 0.05 m" in both.describe(names, lengths=["left_lift", "lift_right"])
+    assert "lifts sag 0.05 m" in both.describe(names, lengths=[0, 3])
     nothing = replace(gaps, gap=0.01 * gaps.gap)
     assert "no joint rests more than 0.02 rad" in nothing.describe(shown.joint_names)
 
