@@ -17,6 +17,7 @@ from tpgmm_datasets.units import Unit
 from tpgmm_torch.checks.report import Finding, shorten_list
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.pose_names import quaternion_groups
+from tpgmm_torch.motion.command_gaps import FEWEST
 
 DIFFERENCES, VELOCITIES = "differences from step to step", "velocities"
 SCALED = "normalised values, or in another unit than the joints"
@@ -154,13 +155,14 @@ def _choose_unit(joints: JointColumns, sent: Feature, joint: int, column: int) -
     """Choose the unit of an action: that of the joint, unless the set declares another."""
     declared = joints.feature.units and joints.feature.units[joint]
     own = sent.units and sent.units[column]
-    return own if own and declared and own != declared else joints.units[joint]
+    return own if own and own != declared else joints.units[joint]
 
 
 def classify_commands(commands: Array, joints: Array) -> str:
     """Tell what commands are that are no postures of the joints; empty if they are.
 
-    A command belongs to the joints of the next row, or of its own.
+    A command belongs to the joints of the next row, or of its own. Of episodes that are too
+    short to learn gaps from, nothing is told.
 
     Parameters
     ----------
@@ -176,7 +178,7 @@ def classify_commands(commands: Array, joints: Array) -> str:
     'differences from step to step'
     """
     moved = (joints.std(0) > STILL) & (commands != joints).any(0)
-    if len(joints) < 3 or not moved.any():
+    if len(joints) < FEWEST or not moved.any():
         return ""
     commands, joints = commands[:, moved], joints[:, moved]
     if any(_agree(*rows) for rows in ((commands[:-1], joints[1:]), (commands, joints))):
