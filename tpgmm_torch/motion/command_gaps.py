@@ -42,6 +42,8 @@ LONGEST_LAG = 0.5
 NOTICED = 0.02
 #: What tells joints of two arms apart.
 SIDE = re.compile(r"(^|_)(left|right|l|r)(_|$)", re.IGNORECASE)
+#: Words that end so have a longer plural.
+HISSING = ("s", "x", "h")
 #: Share of its largest speed above which a joint moves, and rows that tell its lag.
 MOVING, FEWEST = 0.05, 10
 
@@ -136,7 +138,11 @@ class CommandGaps:
         for (called, sags), joints in sorted(alike.items(), key=lambda one: -max(most[one[1]])):
             name, be, sag = joint_names[joints[0]], "is", "sags"
             if len(joints) > 1:
-                name, be, sag = f"{called}s", "are", "sag"
+                name, be, sag = (
+                    f"{called}{'es' if called.endswith(HISSING) else 's'}",
+                    "are",
+                    "sag",
+                )
             unit = "m" if joints[0] in lengths else "rad"
             far = f"{round(max(most[joints]), 2):g} {unit}"
             said.append(
