@@ -19,6 +19,7 @@ from tpgmm_datasets.conversion.assembly import (
     event_sources,
     frame_sources,
 )
+from tpgmm_datasets.conversion.commands import report_left_out
 from tpgmm_datasets.errors import DatasetError, list_problems
 from tpgmm_datasets.events import doubtful_events
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
@@ -84,6 +85,7 @@ class Recording:
         read = 0
         lost: list[DatasetError] = []  # all without the event that a frame is at
         self.assembly.doubtful.clear()
+        self.assembly.left_out.clear()
         try:
             for rows in read_episodes(layout, self.episodes, features, policy):
                 try:
@@ -130,6 +132,7 @@ class Recording:
         known = robot if isinstance(robot, Kinematics) else None
         report = check_summaries(summaries, known, raw)
         findings = [*self.findings, *doubtful_events(self.assembly.doubtful, "episode")]
+        findings += report_left_out(self.assembly.left_out)
         for one in report:
             own = {*one.names} <= raw and one.check in ("units", "limits")
             findings.append(replace(one, remedy=RAW) if own else one)
@@ -187,7 +190,7 @@ def open_recording(
     if (stated := stated_range(layout.root, feature.key, feature.width)) is not None:
         assembly.joints.values(stated, file="meta/stats.json")
     findings = list[Finding]()
-    if not joints:
+    if joints in (None, "measured"):
         findings += named.commanded_joints(layout, feature.key)
     if frames is None:
         findings += _find_unnamed_frames(layout)
@@ -304,10 +307,10 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         of the set that are not its joints are left out. Without a robot all values are
         taken.
     joints : str, optional
-        The feature that holds the joints, or ``"measured"`` (``observation.state``, ``state``
-        and their variants) or ``"commanded"`` (``action``). The default is what was measured,
-        else what was commanded. Measured joints lag behind commanded ones; what the robot
-        holds is found in them where commanded ones are read, as the demonstrations' ``holds``.
+        The feature that holds the joints. The default is what was measured
+        (``observation.state``, ``state`` and their variants), else what was commanded
+        (``action``). Where both have the same joints, the latter are the demonstrations'
+        ``commands``; actions that are no postures are left out, with a warning.
     joint_names : mapping or sequence of str, or "robot", optional
         Names instead of the data set's: all of them in order, or name in the set to name of
         the robot's joint for those that differ. ``"robot"``: the values are the robot's joints

@@ -1,4 +1,4 @@
-"""Roles of the columns of a table: joints, poses, wrenches, events, and what is no motion."""
+"""Roles of the columns of a table: joints, commands, poses, wrenches, events, counters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     #: Episodes of a table, with what they are called.
     Parts = Sequence[tuple[Any, pd.DataFrame]]
 
-EVENT, COVARIANCE, WRENCH = "event.", "covariance.", "wrench."
+EVENT, COVARIANCE, WRENCH, COMMAND = "event.", "covariance.", "wrench.", "command."
 #: The column that may be missing.
 EPISODE = "episode"
 #: Where pandas keeps which columns are joints, among the attributes of a table.
@@ -121,7 +121,7 @@ def _drop_empty(table: pd.DataFrame, known: Collection[str]) -> pd.DataFrame:
 
 
 def list_motion_columns(table: pd.DataFrame, known: Collection[str]) -> list[str]:
-    """List the columns of joints and poses: all but the ``known``, events, wrenches, ...
+    """List the columns of joints and poses: all but the ``known``, events, commands, ...
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def list_motion_columns(table: pd.DataFrame, known: Collection[str]) -> list[str
     known : collection of str
         Columns that are something else.
     """
-    others = EVENT, COVARIANCE, WRENCH
+    others = EVENT, COVARIANCE, WRENCH, COMMAND
     return [n for n in table.columns if n not in known and not n.startswith(others)]
 
 

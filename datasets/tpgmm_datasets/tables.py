@@ -1,11 +1,12 @@
 """Demonstrations and trajectories as flat tables of pandas, and back; CSV and parquet.
 
-A row is a time step. The columns are ``episode``, ``time`` [s], the joints by name, the seven
-numbers of each frame (``bottle.x``, ``bottle.y``, ``bottle.z`` [m], ``bottle.qw`` to
-``bottle.qz``), the wrench of each link (``wrench.tool.fx`` to ``wrench.tool.fz`` [N] and
-``wrench.tool.tx`` to ``wrench.tool.tz`` [N m]), the time of each event (``event.close`` [s],
-the same in all rows of an episode) and, of trajectories, the upper triangle of the joints'
-covariance (``covariance.elbow.wrist``). What a column of a table that others wrote is,
+A row is a time step. The columns are ``episode``, ``time`` [s], the joints by name, what was
+commanded of each (``command.elbow`` [rad or m]), the seven numbers of each frame
+(``bottle.x``, ``bottle.y``, ``bottle.z`` [m], ``bottle.qw`` to ``bottle.qz``), the wrench of
+each link (``wrench.tool.fx`` to ``wrench.tool.fz`` [N] and ``wrench.tool.tx`` to
+``wrench.tool.tz`` [N m]), the time of each event (``event.close`` [s], the same in all rows of
+an episode) and, of trajectories, the upper triangle of the joints' covariance
+(``covariance.elbow.wrist``). What a column of a table that others wrote is,
 :mod:`tpgmm_datasets.table_columns` decides.
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +87,7 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
     checked = check_demonstrations(demonstrations)
     parts = [
         _motion_columns(episode, one, one.frames)
+        | _command_columns(one)
         | _wrench_columns(one)
         | {f"{roles.EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
         for episode, one in enumerate(checked)
@@ -145,7 +148,8 @@ def demonstrations_from_frame(
     table : pandas.DataFrame
         Rows of an episode in order of time. A pose that is the same in all rows of an episode
         becomes a constant frame; a column that is NaN throughout an episode is not in its
-        demonstration.
+        demonstration. Joints without a column ``command.JOINT``, where others have one, were
+        commanded where they were.
     joints : sequence of str, optional
         Columns of the joints [rad or m], where not all columns that are nothing else are meant,
         or where they look like poses, as those of tracked hands do.
@@ -188,7 +192,9 @@ def demonstrations_from_frame(
             at, values = (torch.from_numpy(numbers(kept, each)) for each in ([time], names))
             poses, events = _read_poses(kept, {time, episode, *names}), _read_events(kept)
             forces = {n: torch.from_numpy(w) for n, w in _read_wrenches(kept).items()}
-            made.append(Demonstration(at[:, 0], values, poses, called, events, wrenches=forces))
+            sent = _read_commands(kept, names, values)
+            one = Demonstration(at[:, 0], values, poses, called, events, wrenches=forces)
+            made.append(replace(one, commands=sent))
         except (DataError, UnknownNameError) as error:
             raise DataError(f"episode {label} of the table: {error}") from error
     return made
@@ -368,6 +374,31 @@ def _read_poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
         pose = pose[0] if bool((pose == pose[0]).all()) else pose
         frames[name] = Frame(pose[..., :3], pose[..., 3:])
     return frames
+
+
+def _command_columns(motion: Demonstration) -> dict[str, Array]:
+    """Return what joints were commanded, by column."""
+    if motion.commands is None:
+        return {}
+    names = [f"{roles.COMMAND}{name}" for name in _name_joints(motion)]
+    return dict(zip(names, as_array(motion.commands).T, strict=True))
+
+
+def _read_commands(
+    part: pd.DataFrame, joints: Sequence[str], measured: torch.Tensor
+) -> torch.Tensor | None:
+    """Read the commands of joints (T, n_joints); None where there are none."""
+    known = [f"{roles.COMMAND}{name}" for name in joints]
+    found = [n for n in part.columns if n.startswith(roles.COMMAND) and n not in joints]
+    if odd := [name for name in found if name not in known]:
+        raise DataError(
+            f"columns {odd} are commands of no joint: call them {roles.COMMAND} and one of "
+            f"{list(joints)}, or drop them"
+        )
+    commands = measured.clone()
+    for name in found:
+        commands[:, known.index(name)] = torch.from_numpy(numbers(part, [name])[:, 0])
+    return commands if found else None
 
 
 def _wrench_columns(motion: Demonstration) -> dict[str, Array]:

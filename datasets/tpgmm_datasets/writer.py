@@ -52,11 +52,11 @@ def save_lerobot(
 ) -> Path:
     """Write demonstrations as a LeRobot data set (v3.0), one episode each.
 
-    Joints become ``observation.state`` and, one step ahead, ``action``; all frames together
-    ``observation.environment_state``, seven values each; an event ``close`` the column
-    ``event.close``, true at the nearest step. Time starts at 0 in the set. LeRobot's own
-    tools open it, and ``load_lerobot(path)`` gives the demonstrations back (to the precision
-    of ``dtype``; events to the nearest step).
+    Joints become ``observation.state``; commands, or without them the joints one step ahead,
+    ``action``; all frames together ``observation.environment_state``, seven values each; an
+    event ``close`` the column ``event.close``, true at the nearest step. Time starts at 0 in
+    the set. LeRobot's own tools open it, and ``load_lerobot(path)`` gives the demonstrations
+    back (to the precision of ``dtype``; events to the nearest step).
 
     Parameters
     ----------
@@ -69,8 +69,7 @@ def save_lerobot(
     task : str or sequence of str
         What was done, for all or for each demonstration.
     actions : sequence of array-like of shape (T, n_joints), optional
-        The references that were commanded at each step of each demonstration, its joints
-        then being what was measured. The default is the joints one step ahead.
+        What was commanded at each step of each demonstration, if not its ``commands``.
     robot_type : str, optional
         Name of the robot, for the metadata.
     units : mapping of str to str, optional

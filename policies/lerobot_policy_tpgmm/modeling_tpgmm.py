@@ -36,6 +36,7 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_control.loop.command import Command, Status
 from tpgmm_control.loop.controller import Controller
 from tpgmm_control.obstacles import Scene
+from tpgmm_datasets.conversion.joints import LEARNED_BESIDE
 from tpgmm_datasets.lerobot.columns import WRENCH
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import consistent, read_whole, recover
@@ -187,7 +188,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _handle_removed_options(self) -> None:
         """Refuse to train with options of release 0.3; a policy saved with them runs."""
-        if names := ", ".join(self.config.training.clear_removed_options()):
+        training = self.config.training
+        if training.learn_from == "commanded" and self._model is None:
+            log.warning("--policy.training.learn_from=commanded %s", LEARNED_BESIDE)
+        training.learn_from = None
+        if names := ", ".join(training.clear_removed_options()):
             said = f"{names}: lerobot-train fits by EM alone since 0.4, without gradient steps"
             if self._model is None:
                 raise DataError(f"{said}. Leave the option out")

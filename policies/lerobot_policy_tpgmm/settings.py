@@ -9,6 +9,7 @@ from typing import Any
 from tpgmm_control.loop.clock import Clock
 from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.trust import Trust
+from tpgmm_datasets.conversion.joints import OLD_WORDS
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.structure.choices import ALIGNMENTS
@@ -19,7 +20,7 @@ __all__ = ["ControlConfig", "EMConfig", "FusionConfig"]
 Bound = dict[str, float] | list[float] | float | None
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def check_choice(name: str, value: Any, choices: tuple[str | None, ...]) -> None:
     """Refuse a ``value`` that is not among the ``choices`` of a setting.
 
     Raises
@@ -182,9 +183,6 @@ class TrainingConfig:
         Compared by time warping, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
         of the links and the joints.
-    learn_from : {"measured", "commanded"}, default="measured"
-        Whether the joints of a demonstration are its states or its actions. Measured joints
-        lag behind commanded ones, by which a skill learned from them misses.
     robust : bool, default=True
         Whether episodes that are unlike the others are left out.
     plausibility : {"warn", "error", "ignore"}, default="warn"
@@ -198,19 +196,20 @@ class TrainingConfig:
         :func:`tpgmm_datasets.events.parse_event` takes it. Others are those of the columns
         ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
         frame is are found by themselves, where there is no such column.
-    loss, optimizer_lr : optional
-        Of policies saved by release 0.3, for steps by gradient that are no more.
+    loss, optimizer_lr, learn_from : optional
+        Of policies saved by release 0.3, for steps by gradient and a choice of joints that are
+        no more.
     """
 
     alignment: str = "dtw"
     alignment_features: list[str] | None = None
-    learn_from: str = "measured"
     robust: bool = True
     plausibility: str = "warn"
     link_frames: dict[str, str] = field(default_factory=dict)
     events: dict[str, str] = field(default_factory=dict)
     loss: str | None = None
     optimizer_lr: float | None = None
+    learn_from: str | None = None
 
     def clear_removed_options(self) -> list[str]:
         """Forget options of release 0.3 that have no effect; return those that were given."""
@@ -226,5 +225,5 @@ class TrainingConfig:
         DataError
         """
         check_choice("training.alignment", self.alignment, ALIGNMENTS)
-        check_choice("training.learn_from", self.learn_from, ("measured", "commanded"))
+        check_choice("training.learn_from", self.learn_from, (None, *OLD_WORDS))
         check_choice("training.plausibility", self.plausibility, ("warn", "error", "ignore"))

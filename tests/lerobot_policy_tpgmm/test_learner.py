@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.carrying import lagging_set
 from tests.support.errands import HAND
 from tests.support.policies import act, loaded, seen
 from tests.support.skills import HANDLING, HANDS, same
@@ -19,16 +18,16 @@ from tests.support.training import (
     epoch,
     fresh,
     resumed,
+    slow_waves,
     trained,
 )
 from tests.support.two_ways import ARM, Handles, another_handle_each, tip, two_ways_set
-from tpgmm_datasets import load_lerobot
+from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment, LinearTimeNormalization
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import encode
-from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
@@ -149,18 +148,32 @@ def test_several_ways_are_found_and_each_robot_goes_the_one_that_suits(tmp_path)
         assert float((tip(joints) - handles).norm(dim=-1).min()) < 0.015
 
 
-def test_commanded_joints_are_learned_by_name(commanded, tmp_path):
+def test_commands_are_learned_beside_measured_joints(commanded, caplog):
     options = {**WAVES, "alignment": "linear"}
-    for joints in ("measured", "commanded"):
-        demonstrations = load_lerobot(commanded.root, joints=joints, robot=JointSpace(NAMES))
-        aligned = LinearTimeNormalization().fit_transform(demonstrations)
-        policy = trained(commanded, learn_from=joints, **options)
-        same(policy.to_estimator(), TaskParameterizedGMM(**WAVES).fit(aligned), 1e-9)
-    options = {"robot": encode(Poses(["hand"])), "operators": ["position:hand@bottle"]}
-    options |= {"alignment": "none", "n_components": 2}
-    lagging = dataset(lagging_set(tmp_path / "lagging"))
-    one, other = (trained(lagging, learn_from=j, **options) for j in ("measured", "commanded"))
-    assert len(one.skill.holds) == 1 and one.skill.holds == other.skill.holds
+    aligned = LinearTimeNormalization().fit_transform(
+        load_lerobot(commanded.root, robot=JointSpace(NAMES))
+    )
+    model = TaskParameterizedGMM(**WAVES).fit(aligned)
+    caplog.set_level(logging.INFO)
+    policy = trained(commanded, **options)
+    assert "servos: " in caplog.text and "learn_from" not in caplog.text
+    same(policy.to_estimator(), model, 1e-9)
+    time = model.time_.numpy()
+    gaps = zip(policy.skill.command_gaps(time), model.skill.command_gaps(time), strict=True)
+    assert all(np.allclose(one, other, atol=1e-6) for one, other in gaps)
+    again = trained(commanded, learn_from="commanded", **options)
+    assert caplog.text.count("commands are learned beside measured joints now") == 1
+    same(again.to_estimator(), model, 1e-9)
+    assert again.config.training.learn_from is None
+
+
+def test_actions_that_are_no_postures_are_not_learned_and_said(tmp_path):
+    shown = slow_waves()
+    steps = [torch.diff(one.joints, dim=0, append=one.joints[-1:]) for one in shown]
+    save_lerobot(shown, tmp_path / "set", fps=FPS, task="wave", actions=steps)
+    with pytest.warns(PlausibilityWarning, match="'action' holds differences from step to"):
+        policy = trained(dataset(tmp_path / "set"), alignment="linear", **WAVES)
+    assert policy.skill.command_gaps(np.zeros(1)) is None
 
 
 # What is said

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,13 +10,11 @@ from torch import Tensor
 
 from tests.support.worlds import upper_body
 from tpgmm_control import Controller
-from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Demonstration, Frame, Hold, Situation, TaskParameterizedGMM, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator
-from tpgmm_torch.robots import Poses
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 
 HAND = "l_hand"
@@ -163,22 +160,6 @@ def placed(model: TaskParameterizedGMM, scene: Scene, slips: Tensor) -> Tensor:
             bottle = hand.compose(grasp)
         controller.step(now - controller.time, frames={**scene.frames, "bottle": bottle})
     return (bottle.position - scene.tray.position).norm(dim=-1)
-
-
-def lagging_set(path: Path) -> Path:
-    """A tracked hand takes a bottle along and leaves it, 0.3 s behind what was commanded."""
-    time = torch.arange(121, dtype=torch.float64) / 20
-    shown, actions = list[Demonstration](), []
-    for y in (-0.1, 0.0, 0.05, 0.1):
-
-        def hand(time: Tensor, y: float = y) -> Frame:
-            return Frame(torch.stack((0.3 * (time / 2).cos(), y + 0.1 * time, 0 * time), -1))
-
-        seen, sent = (Poses.joints({"hand": hand(at)}) for at in (time, time + 0.3))
-        frames, names = {"bottle": hand(time.clamp(2.0, 4.0))}, Poses(["hand"]).joint_names
-        shown.append(Demonstration(time, seen, frames, names))
-        actions.append(sent)
-    return save_lerobot(shown, path, fps=20, task="take along", actions=actions)
 
 
 #: When the bottle is held.

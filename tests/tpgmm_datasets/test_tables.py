@@ -67,6 +67,30 @@ def test_to_a_table_and_back_is_the_identity(lengths, named, event):
         assert_same(found, expected)
 
 
+def test_commands_are_columns_beside_the_joints(tmp_path):
+    one = demonstration()
+    one = replace(one, commands=one.joints + 0.05)
+    plain = demonstration(1, 4)
+    table = demonstrations_to_frame([one, plain])
+    assert [name for name in table if name.startswith("command.")] == [
+        "command.shoulder",
+        "command.elbow",
+    ]
+    for suffix in (".csv", ".parquet"):
+        write_table(table, path := tmp_path / f"table{suffix}")
+        found, without = demonstrations_from_frame(read_table(path))
+        assert_same(found, one)
+        assert torch.equal(found.commands, one.commands) and without.commands is None
+    [first, _] = demonstrations_from_frame(table.drop(columns="command.elbow"))
+    expected = torch.stack((one.commands[:, 0], one.joints[:, 1]), 1)
+    assert torch.equal(first.commands, expected)
+    for joints in (None, NAMES):
+        with pytest.raises(DataError, match=r"'command.wrist'\] are commands of no joint"):
+            demonstrations_from_frame(
+                table.rename(columns={"command.elbow": "command.wrist"}), joints=joints
+            )
+
+
 def test_the_table_is_flat():
     made = [demonstration(0, 4, events={"go": 0.03}), demonstration(1, 6)]
     table = demonstrations_to_frame(made)

@@ -57,9 +57,9 @@ def test_actions_are_the_references_that_were_given(tmp_path):
     first = demonstration(0)
     second = demonstration(1).reorder(["joint_2", "joint_0", "joint_1"])
     options = {"fps": FPS, "task": "reach"}
-    options["actions"] = [motion.joints + 0.5 for motion in (first, second)]
+    options["actions"] = [motion.joints + 0.05 for motion in (first, second)]
     root = save_lerobot([first, second], tmp_path / "set", **options)
-    for key, shift in (("observation.state", 0.0), ("action", 0.5)):
+    for key, shift in (("observation.state", 0.0), ("action", 0.05)):
         found = load_lerobot(root, joints=key)
         for read, written in zip(found, (first, second), strict=True):
             expected = written.reorder(read.joint_names).joints + shift

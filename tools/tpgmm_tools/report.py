@@ -307,6 +307,8 @@ def _joints(
         "<p>In the situations of all episodes, within the robot's bounds; speeds per second. "
         f"Near is within {NEAR:.0%} of the range, or of the speed.</p>"
     )
+    if (gaps := model.skill.gaps) is not None:
+        text += f"<p>Servos: {gaps.describe(robot.joint_names, robot.lengths)}.</p>"
     none = "No joint comes near its limits of position or speed."
     if not np.isfinite([low, high, limit]).any():
         none = "Limits of the joints are not known: no robot was given."

@@ -12,7 +12,8 @@ command, is a function of the skill's time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -24,8 +25,6 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
-
-__all__ = ["CommandGaps"]
 
 #: Instants of a skill at which gaps are known.
 INSTANTS = 200
@@ -39,6 +38,12 @@ LAG_ERROR, RESTING = 0.3, 0.01
 SETTLED = 3.0
 #: The longest lag of a position servo [s].
 LONGEST_LAG = 0.5
+#: Gaps at rest that are mentioned [rad or m].
+NOTICED = 0.02
+#: What tells joints of two arms apart.
+SIDE = re.compile(r"(^|_)(left|right|l|r)(_|$)", re.IGNORECASE)
+#: Words that end so have a longer plural.
+HISSING = ("s", "x", "h")
 #: Share of its largest speed above which a joint moves, and rows that tell its lag.
 MOVING, FEWEST = 0.05, 10
 
@@ -101,34 +106,49 @@ class CommandGaps:
         )
         return gap, extent
 
-    def describe(self, joint_names: Sequence[str], noticed: float = 0.02) -> str:
-        """Say in a sentence what was learned.
+    def describe(self, joint_names: Sequence[str], lengths: Collection[int] = ()) -> str:
+        """Say in a sentence what was learned, the largest gaps first.
+
+        A joint whose gap comes and goes meets something, as a gripper does; one that always
+        has a gap sags. Joints that are called alike, left and right, are told of together.
 
         Parameters
         ----------
         joint_names : sequence of str
             Names of the joints, in their order.
-        noticed : float
-            Gaps that are smaller are not mentioned [rad or m].
+        lengths : collection of int
+            Numbers of those that are in metres.
 
         Examples
         --------
         >>> time = torch.linspace(0, 1, 5, dtype=torch.float64)
-        >>> gap = torch.zeros(5, 2, dtype=torch.float64)
-        >>> gap[:, 1] = -0.06
-        >>> CommandGaps(time, gap, gap.abs(), gap[0].abs()).describe(["pan", "lift"])
-        'servos: lift is commanded by up to -0.06 beyond; lags of 0.00 to 0.06 s'
+        >>> gap = torch.zeros(5, 3, dtype=torch.float64)
+        >>> gap[:, 0], gap[2:, 1:] = -0.06, 0.6
+        >>> gaps = CommandGaps(time, gap, gap.abs(), gap[0].abs())
+        >>> gaps.describe(["lift", "left_gripper", "right_gripper"])
+        'grippers are commanded 0.6 rad beyond; lift sags 0.06 rad'
         """
-        gap = as_array(self.gap)
-        most = np.take_along_axis(gap, np.abs(gap).argmax(0)[None], 0)[0]
-        said = [
-            f"{name} is commanded by up to {size:+.2f} beyond"
-            for name, size in zip(joint_names, most, strict=True)
-            if abs(size) > noticed
-        ]
-        lag = as_array(self.lag)
-        late = f"lags of {lag.min():.2f} to {lag.max():.2f} s"
-        return f"servos: {'; '.join([*said, late])}"
+        size = np.abs(as_array(self.gap))
+        most, least = size.max(0), np.quantile(size, 0.1, axis=0)
+        alike: dict[tuple[str, bool], list[int]] = {}
+        for joint in np.flatnonzero(most > NOTICED).tolist():
+            called = SIDE.sub("", joint_names[joint]) or joint_names[joint]
+            alike.setdefault((called, bool(least[joint] > NOTICED / 2)), []).append(joint)
+        said = []
+        for (called, sags), joints in sorted(alike.items(), key=lambda one: -max(most[one[1]])):
+            name, be, sag = joint_names[joints[0]], "is", "sags"
+            if len(joints) > 1:
+                name, be, sag = (
+                    f"{called}{'es' if called.endswith(HISSING) else 's'}",
+                    "are",
+                    "sag",
+                )
+            unit = "m" if joints[0] in lengths else "rad"
+            far = f"{round(max(most[joints]), 2):g} {unit}"
+            said.append(
+                f"{name} {sag} {far}" if sags else f"{name} {be} commanded {far} beyond"
+            )
+        return "; ".join(said) or f"no joint rests more than {NOTICED} rad from its command"
 
 
 def episode_gaps(demonstration: Demonstration) -> Array | None:

@@ -155,26 +155,6 @@ def with_holds(
     return [replace(one, holds=tuple(holds)) for one in demonstrations]
 
 
-def holding_as_in(
-    demonstration: Demonstration, joints: Tensor, kinematics: Kinematics
-) -> Demonstration:
-    """Attach what is held where the joints are others.
-
-    Commanded joints are ahead of what they carry: what is held is found in measured ones.
-
-    Parameters
-    ----------
-    demonstration : Demonstration
-        With poses of objects over time.
-    joints : Tensor of shape (T, n_joints)
-        In the order of the demonstration's.
-    kinematics : Kinematics
-        Whose links may hold.
-    """
-    seen = replace(demonstration, joints=joints)
-    return replace(demonstration, holds=find_holds([seen], kinematics))
-
-
 def demonstrated_holds(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from tpgmm_datasets.conversion.joints import COMMANDED, MEASURED, JointColumns
+from tpgmm_datasets.conversion.commands import CommandColumns
+from tpgmm_datasets.conversion.joints import JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose, MeasuredPoses
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
@@ -24,8 +26,6 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import pose_groups
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.hold_detection import holding_as_in
 
 Pose = FramePose | LinkPose | MeasuredPoses | Frame
 FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]
@@ -158,6 +158,8 @@ class Assembly:
     doubtful : list of (int, str, float)
         Events that were looked for and not found with confidence: index of the episode,
         event, confidence.
+    left_out : list of (int, str)
+        Actions that are no postures: index of the episode, and what they are.
 
     Raises
     ------
@@ -173,6 +175,7 @@ class Assembly:
     rate: float | None
     trim: float | None
     doubtful: list[tuple[int, str, float]] = field(default_factory=list, compare=False)
+    left_out: list[tuple[int, str]] = field(default_factory=list, compare=False)
 
     def __post_init__(self) -> None:
         for name, source in self.frames.items():
@@ -185,49 +188,29 @@ class Assembly:
         layout, frames = self.layout, self.frames.values()
         poses = [one for one in frames if isinstance(one, FramePose)]
         objects = map(layout.feature, dict.fromkeys(pose.feature for pose in poses))
-        several = self.joints, self.measured_joints, self.commanded_joints
-        joints = [one.feature for one in several if one]
+        joints = [self.joints.feature]
+        joints += [] if self.commands is None else [self.commands.actions.feature]
         flags, wrenches = signals.event_features(layout), signals.wrench_features(layout)
         return [*joints, *objects, *flags, *wrenches]
 
-    @property
-    def measured_joints(self) -> JointColumns | None:
-        """The measured joints, where ``joints`` are the same as they are commanded.
+    @cached_property
+    def commands(self) -> CommandColumns | None:
+        """Find where the commands of the joints are; None where the set has none."""
+        return CommandColumns.find(self.layout, self.joints)
 
-        In them it is found what the robot holds.
-        """
-        stored, read = self.layout.features, self.joints.feature
-        state = next((stored[key] for key in MEASURED if key in stored), read)
-        alike = state != read and (state.names, state.width) == (read.names, read.width)
-        known = read.key in COMMANDED and isinstance(self.robot, Kinematics)
-        return replace(self.joints, feature=state) if alike and known else None
-
-    @property
-    def commanded_joints(self) -> JointColumns | None:
-        """The commands of the same joints, where ``joints`` are measured."""
-        stored, read = self.layout.features, self.joints.feature
-        sent = next((stored[key] for key in COMMANDED if key in stored), read)
-        alike = read.key in MEASURED and sent.key in COMMANDED and sent.width == read.width
-        if not alike or sent.names not in (None, read.names):
-            return None
-        return replace(self.joints, feature=sent)
-
-    def _commands(self, rows: EpisodeRows, joints: Array) -> Tensor | None:
+    def _read_commands(self, rows: EpisodeRows, joints: Array) -> Tensor | None:
         """Read the commands of an episode, where they are postures."""
-        sent = self.commanded_joints
-        if sent is None:
+        if self.commands is None:
             return None
-        try:
-            commands = sent.values(rows.values[sent.feature.key], **rows.episode.where)
-        except DatasetError:  # of other units: what they are is for whoever learns from them
-            return None
-        # differences, velocities and normalised actions explain nothing of where joints are
-        explained = (commands - joints).var(0).sum() < joints.var(0).sum()
-        return torch.from_numpy(commands) if explained else None
+        stored = rows.values[self.commands.actions.feature.key]
+        commands, kind = self.commands.read(stored, joints, self.joints.names)
+        if kind:
+            self.left_out.append((rows.episode.index, kind))
+        return None if commands is None else torch.from_numpy(commands)
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
-        where, measured = rows.episode.where, self.measured_joints
+        where = rows.episode.where
         joints = self.joints.values(rows.values[self.joints.feature.key], **where)
         demonstration = Demonstration(
             torch.from_numpy(rows.time),
@@ -236,11 +219,8 @@ class Assembly:
             self.joints.names,
             signals.flagged_events(rows),
             wrenches=signals.stored_wrenches(rows),
-            commands=self._commands(rows, joints),
+            commands=self._read_commands(rows, joints),
         )
-        if measured is not None:
-            joints = measured.values(rows.values[measured.feature.key], **where)
-            demonstration = holding_as_in(demonstration, torch.from_numpy(joints), self.robot)
         demonstration = self._with_events(demonstration, rows)
         if self.trim is not None:
             demonstration = trim(demonstration, self.trim, **where)

@@ -24,6 +24,9 @@ Labels = tuple[str, ...] | None
 MEASURED = ("observation.state", "observation.states", "state", "observation.qpos")
 COMMANDED = ("action", "actions")
 JOINT_FEATURES = (*MEASURED, *COMMANDED)
+#: What releases before 0.4 took for ``joints``; it changes nothing.
+OLD_WORDS = ("measured", "commanded")
+LEARNED_BESIDE = "can go: commands are learned beside measured joints now"
 #: Parts of the names of features that may hold measured joints.
 LIKE_JOINTS = re.compile("joint|qpos|proprio|state|position", re.IGNORECASE)
 
@@ -84,27 +87,28 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
     layout : Layout
         Metadata of the data set.
     joints : str, optional
-        Its name; ``"measured"`` or ``"commanded"`` for the usual one of states or of actions.
-        The default is the first that there is of both.
+        Its name. The default is the first usual one that there is, measured before commanded.
 
     Raises
     ------
     DatasetError
         If there is no usual one.
     """
-    usual = {"measured": MEASURED, "commanded": COMMANDED, None: JOINT_FEATURES}
-    if joints in layout.features or joints not in usual:
+    if joints in layout.features or joints not in (None, *OLD_WORDS):
         return str(joints)
-    for key in usual[joints]:
-        if key in layout.features and not layout.features[key].is_camera:
-            return key
-    wanted = "joints" if joints is None else f"{joints} joints"
-    raise DatasetError(
-        f"there are no {wanted}: none of {list(usual[joints])} is a column. Say which holds "
-        f"them, joints=... (--joints), of {sorted(layout.features)}",
-        check="joints",
-        file="meta/info.json",
-    )
+    usual = (key for key in JOINT_FEATURES if key in layout.features)
+    key = next((key for key in usual if not layout.features[key].is_camera), None)
+    if key is None:
+        raise DatasetError(
+            f"there are no joints: none of {list(JOINT_FEATURES)} is a column. Say which holds "
+            f"them, joints=... (--joints), of {sorted(layout.features)}",
+            check="joints",
+            file="meta/info.json",
+        )
+    if joints == "commanded" and key in MEASURED:
+        said = f"joints='commanded' (--joints) {LEARNED_BESIDE}"
+        warnings.warn(said, DatasetWarning, stacklevel=2)
+    return key
 
 
 def commanded_joints(layout: Layout, key: str) -> Iterator[Finding]:

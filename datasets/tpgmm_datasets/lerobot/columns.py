@@ -134,8 +134,9 @@ def demonstration_columns(
     steps = len(demonstration)
     grid = _check_grid(demonstration, number, fps)
     joints = as_array(demonstration.joints)
-    ahead = np.concatenate((joints[1:], joints[-1:]))
-    columns: dict[str, Array] = {STATE: joints, ACTION: ahead}
+    sent = demonstration.commands
+    actions = np.concatenate((joints[1:], joints[-1:])) if sent is None else as_array(sent)
+    columns: dict[str, Array] = {STATE: joints, ACTION: actions}
     if demonstration.frames:
         first = features[ENVIRONMENT]["names"][:: len(POSE_PARTS)]
         order = [demonstration.frame(name.removesuffix(".x")) for name in first]

@@ -22,15 +22,17 @@ from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.training.epoch_recorder import EpochRecorder, episode_ranges
 from tpgmm_datasets import check
 from tpgmm_datasets.conversion.assembly import event_sources
+from tpgmm_datasets.conversion.commands import keep_postures, report_left_out
 from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT, WRENCH
 from tpgmm_datasets.lerobot.stored_signals import stored_events
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
+from tpgmm_torch.checks.report import Report
+from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.choices import aligner, learn, prepare_demonstrations
-from tpgmm_torch.training.hold_detection import holding_as_in
 
 log = logging.getLogger(__name__)
 
@@ -180,11 +182,13 @@ class Learner:
     def _align(self, episodes: Mapping[int, Mapping[str, Tensor]]) -> list[Demonstration]:
         """Bring the demonstrations of recorded episodes onto one clock."""
         training = self._config.training
-        shown = {
-            number: self._make_demonstration(episodes[number]) for number in sorted(episodes)
-        }
+        shown, left_out = dict[int, Demonstration](), list[tuple[int, str]]()
+        for number in sorted(episodes):
+            shown[number], kind = self._make_demonstration(episodes[number])
+            left_out += [(number, kind)] if kind else []
         demonstrations = self._add_link_frames(self._add_events(shown))
-        check(demonstrations, self._kinematics, self._joints.raw).act()
+        report = check(demonstrations, self._kinematics, self._joints.raw)
+        Report.of([*report_left_out(left_out), *report], report.subject).act()
         chosen = aligner(training.alignment, self._kinematics, training.alignment_features)
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(demonstrations))
@@ -202,6 +206,10 @@ class Learner:
         robust, holds = config.training.robust, config.given_holds()
         shown = prepare_demonstrations(aligned, self._operators, estimator.robot, robust, holds)
         self.model, reports = learn(estimator, shown, config.choices())
+        gaps = getattr(getattr(self.model, "skill", self.model), "gaps", None)
+        if gaps is not None:
+            robot = self._kinematics
+            log.info("servos: %s", gaps.describe(robot.joint_names, robot.lengths))
         for report in reports:
             log.info("%s", report)
         if isinstance(self.model, TaskParameterizedGMM):
@@ -249,26 +257,28 @@ class Learner:
             for one in shown.values()
         ]
 
-    def _make_demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:
-        """Make a demonstration of the columns of an episode."""
+    def _make_demonstration(self, columns: Mapping[str, Tensor]) -> tuple[Demonstration, str]:
+        """Make a demonstration of an episode; and say what actions are, if no postures."""
         rows = {key: column.to(self._joints.scale.device) for key, column in columns.items()}
-        measured = self._joints.joints(rows[OBS_STATE]).cpu()
-        from_actions = self._config.training.learn_from == "commanded"
-        joints = self._joints.decode_action(rows[ACTION]).cpu() if from_actions else measured
+        joints = self._joints.joints(rows[OBS_STATE]).cpu()
+        actions = self._joints.decode_action(rows[ACTION]).cpu()
+        names = self._kinematics.joint_names
+        commands, kind = keep_postures(as_array(actions), as_array(joints), names)
         follow = self._config.control.follow_frames
         frames = self._frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
         shown = Demonstration(
             torch.arange(len(joints), dtype=torch.float64) / self._fps,
             joints,
             {name: (f if follow else f[0]).to("cpu") for name, f in frames.items()},
-            self._kinematics.joint_names,
+            names,
             wrenches={
                 key.removeprefix(WRENCH): column.double().cpu()
                 for key, column in columns.items()
                 if key.startswith(WRENCH)
             },
+            commands=None if commands is None else torch.from_numpy(commands),
         )
-        return holding_as_in(shown, measured, self._kinematics) if from_actions else shown
+        return shown, kind
 
 
 def check_one_process() -> None:

@@ -1,11 +1,8 @@
 """Which values are the joints, and what they are called."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from tests.support.carrying import lagging_set
 from tests.support.lerobot_sets import (
     DATA,
     Arm,
@@ -15,10 +12,8 @@ from tests.support.lerobot_sets import (
     joints_of,
     to_v21,
 )
-from tpgmm_datasets import DatasetError, load_lerobot
-from tpgmm_torch import find_holds
+from tpgmm_datasets import DatasetError, DatasetWarning, load_lerobot
 from tpgmm_torch.exceptions import PlausibilityWarning
-from tpgmm_torch.robots import Poses
 
 
 @pytest.mark.parametrize("names", [None, [], {}, ["state"]])
@@ -62,21 +57,12 @@ def test_the_joint_feature_is_found_or_chosen(root):
     action = joints_of(load_lerobot(root, joints="action"))
     # an action is the next state, and the last is that of the end
     assert_equal(action, [torch.cat((e[1:], e[-1:])) for e in expected])
-    assert_equal(joints_of(load_lerobot(root, joints="commanded")), action)
     assert_equal(joints_of(load_lerobot(root, joints="measured")), expected)
+    with pytest.warns(DatasetWarning, match="commands are learned beside") as caught:
+        assert_equal(joints_of(load_lerobot(root, joints="commanded")), expected)
+    assert len(caught) == 1
     rename_state(root, "state")
     assert_equal(joints_of(load_lerobot(root)), expected)
-
-
-def test_what_is_held_is_found_in_measured_joints(tmp_path):
-    options = {"path": lagging_set(tmp_path / "set"), "robot": (hand := Poses(["hand"]))}
-    commanded, measured = (load_lerobot(joints=j, **options) for j in ("commanded", "measured"))
-    [hold] = find_holds(measured, hand)
-    assert find_holds(commanded, hand) == (hold,)
-    assert find_holds([replace(one, holds=None) for one in commanded], hand) != (hold,)
-    shown = load_lerobot(joints="commanded", rate=10, trim=0.01, **options)
-    [other] = find_holds(shown, hand)
-    assert (other.begin, other.end) == pytest.approx((hold.begin, hold.end), abs=0.06)
 
 
 @pytest.mark.parametrize("name", ["observation.states.joint.position", "measured", "arm.qpos"])
@@ -92,7 +78,9 @@ def test_commands_in_place_of_an_unusual_state_are_told_once(root, name):
     assert_equal([m[1:] for m in measured], [c[:-1] for c in commands])
 
 
-def test_commanded_joints_need_actions(root):
-    change_info(root, lambda info: info["features"].pop("action"))
-    with pytest.raises(DatasetError, match=r"there are no commanded joints.*--joints"):
-        load_lerobot(root, joints="commanded")
+def test_a_set_without_joints_is_refused(root):
+    for name in ("action", "observation.state"):
+        change_info(root, lambda info, name=name: info["features"].pop(name))
+    for word in (None, "measured", "commanded"):
+        with pytest.raises(DatasetError, match=r"there are no joints.*--joints"):
+            load_lerobot(root, joints=word)

@@ -55,7 +55,8 @@ def test_idle_starts_and_ends_are_trimmed_but_events_stay(root):
         values[9:12] = values[9]
         return values
 
-    change_table(root, DATA, lambda t: set_column(t, "observation.state", still))
+    for name in ("observation.state", "action"):
+        change_table(root, DATA, lambda t, name=name: set_column(t, name, still))
     whole, cut = load_lerobot(root)[0], load_lerobot(root, trim=1e-6)[0]
     assert_equal([cut.joints], [whole.joints[4:10]])
     assert float(cut.time[0]) == 0

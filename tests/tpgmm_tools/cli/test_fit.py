@@ -1,7 +1,6 @@
 """``tpgmm fit``: options reach the model, and the report says what was learned."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +10,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.support.carrying import lagging_set
+from tests.support import soft_drives
 from tests.support.command_line import UPPER_BODY, output, refusal, run
 from tests.support.mistakes import written_arms
 from tests.support.skills import waves
-from tpgmm_datasets import save_lerobot
+from tpgmm_datasets import resample, save_lerobot
 from tpgmm_torch import Demonstration, Hold
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import load_model, load_skill
@@ -73,13 +72,18 @@ def test_fit_takes_tracked_poses_in_place_of_a_robot(tmp_path):
     assert load_model(tmp_path / "model").kinematics_ == kinematics
 
 
-def test_commanded_joints_hold_what_measured_ones_do(tmp_path):
-    given = "fit", lagging_set(tmp_path / "set"), "--poses", "hand", *QUICK[:2], *QUICK[-4:]
-    for joints in ("measured", "commanded"):
-        text = output(*given, "--joints", joints, "--out", tmp_path / joints)
-        assert "bottle@hand" in re.search("held .*", text)[0]
-    one, other = (load_model(tmp_path / joints).holds_ for joints in ("measured", "commanded"))
-    assert one == other
+@pytest.mark.filterwarnings("default:.*commands are learned beside")
+def test_what_servos_need_is_learned_and_told(tmp_path):
+    shown = [resample(one, 20) for one in soft_drives.demonstrations(sag=0.06)]
+    path = save_lerobot(shown, tmp_path / "set", fps=20, task="fetch")
+    options = "--n-components", 2, "--alignment", "none", "--plausibility", "ignore"
+    given = "fit", path, "--operator", "canonical", *options, "--hold", "none"
+    text = output(*given, "--out", tmp_path / "model")
+    assert f"servos           {soft_drives.NAMES[1]} sags 0.06 rad\n" in text
+    assert load_model(tmp_path / "model").skill.gaps is not None
+    result = run(*given, "--joints", "commanded", "--out", tmp_path / "again")
+    assert result.exit_code == 0 and "servos  " in result.stdout
+    assert result.stderr.count("commands are learned beside measured joints now") == 1
 
 
 def test_implausible_recordings_and_files_in_the_way_are_refused(dataset, tmp_path):

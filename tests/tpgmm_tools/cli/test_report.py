@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.support import skills
+from tests.support import skills, soft_drives
 from tests.support.command_line import output, refusal
 from tpgmm_datasets import save_lerobot
 from tpgmm_tools.report import leave_one_out, write_report
@@ -87,6 +87,14 @@ def test_joints_alone_have_no_limits_and_no_picture(tmp_path):
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "Limits of the joints are not known" in page and "nan" not in page
     assert "comes near" not in page and "<iframe" not in page and "<img" in page
+
+
+def test_what_servos_need_is_told_beside_the_joints(tmp_path):
+    shown = soft_drives.demonstrations(sag=0.06)
+    model = skills.canonical(reg_covar=1e-5).fit(shown)
+    write_report(tmp_path / "page.html", model, shown, most=3)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert f"<p>Servos: {soft_drives.NAMES[1]} sags 0.06 rad.</p>" in page
 
 
 def test_what_cannot_be_left_out_is_an_error(example, tmp_path):

@@ -54,9 +54,16 @@ def test_what_gravity_and_a_grip_take_is_found(rate, leaps):
 
 def test_a_sentence_says_what_was_learned():
     shown = recorded()
-    said = CommandGaps.learn([episode_gaps(shown)], shown.time).describe(shown.joint_names)
-    assert "lift is commanded by up to +0.05 beyond" in said
-    assert "gripper is commanded by up to -0.40 beyond" in said
+    gaps = CommandGaps.learn([episode_gaps(shown)], shown.time)
+    said = "gripper is commanded 0.4 rad beyond; lift sags 0.05 rad"
+    assert gaps.describe(shown.joint_names) == said
+    both = replace(gaps, gap=gaps.gap[:, [0, 1, 1, 0]])
+    names = ["left_lift", "left_gripper", "gripper_r", "lift_right"]
+    said = "grippers are commanded 0.4 rad beyond; lifts sag 0.05 rad"
+    assert both.describe(names) == said
+    assert "lifts sag 0.05 m" in both.describe(names, lengths=[0, 3])
+    nothing = replace(gaps, gap=0.01 * gaps.gap)
+    assert "no joint rests more than 0.02 rad" in nothing.describe(shown.joint_names)
 
 
 def test_nothing_is_learned_without_commands_or_from_what_follows_exactly():
@@ -91,6 +98,6 @@ def test_gaps_are_saved_with_the_model(tmp_path):
             skill.command_gaps(time), model.skill.command_gaps(time), strict=True
         ):
             assert np.array_equal(one, other)
-    assert f"{NAMES[1]} is commanded by up to +0.06 beyond" in model.skill.gaps.describe(NAMES)
+    assert f"{NAMES[1]} sags 0.06 rad" in model.skill.gaps.describe(NAMES)
     assert learned().skill.command_gaps(np.zeros(1)) is None
     assert demonstrations()[0].commands is None

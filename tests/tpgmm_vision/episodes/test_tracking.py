@@ -107,7 +107,7 @@ def test_offsets_of_joints_are_declared_and_read_by_all(tracked, original):
     for one, other in zip(before, after, strict=True):
         away = (other.joints - one.joints).numpy()
         assert np.allclose(away, [OFFSET, 0, 0, 0, 0, 0, 0], atol=1e-6)
-    commanded = load_lerobot(tracked[0], joints="commanded", units="raw")
+    commanded = load_lerobot(tracked[0], joints="action", units="raw")
     assert np.allclose(commanded[0].joints, after[0].joints)
     signals = Signals.of(tracked[0], ROBOT)
     assert signals.units == {} and signals.cell  # which has the offsets

@@ -52,8 +52,8 @@ class DataOptions:
         to 100); with JOINT= of one or, as '*gripper=', of some of them, repeatable. FILE.json
         is LeRobot's calibration, with PREFIX= of one arm. Default: as the set declares.
     joints : ``FEATURE``
-        The feature that holds the joints, or 'measured' or 'commanded'; default
-        observation.state or the like.
+        The feature that holds the joints; default observation.state or the like. What 'action'
+        commands of them is learned beside them.
     joint_name : ``STORED=JOINT``
         The robot's name of a stored joint, repeatable, where the names differ; NAME,NAME,...
         names all values in order, 'robot' says that they are the robot's joints in its order.

@@ -199,9 +199,8 @@ def convert(
 ) -> None:
     """Write a converted data set: layout v3.0, joints in radians, some episodes or joints.
 
-    Reads any set that the other commands read, v2.1 too. Joints, frames and
-    events are kept, as float32; actions become the next joint state (--joints
-    commanded keeps those instead), pictures stay behind.
+    Reads any set that the other commands read, v2.1 too. Joints, frames, events and actions are
+    kept, as float32, actions that are no postures become the next joints; pictures stay behind.
 
     Parameters
     ----------

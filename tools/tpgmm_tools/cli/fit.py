@@ -357,6 +357,9 @@ def _report(learned: Any, read: Any, aligned: Any, reports: list[str]) -> None:
         )
     if isinstance(learned, TaskParameterizedGMM):
         lines |= _sum_up_model(learned, read, aligned)
+    gaps, robot = getattr(skill, "gaps", None), skill.kinematics
+    if gaps is not None:
+        lines["servos"] = gaps.describe(robot.joint_names, robot.lengths)
     _echo(lines)
     for text in reports:
         typer.echo(f"\n{text}\n")
