@@ -185,7 +185,7 @@ class Run:
     def labels(self) -> Sequence[str]:
         """Faults, what is special in its servo, robot and rate, in words."""
         servo, kinds = self.servo, sorted({fault.kind for fault in self.faults})
-        special = {"underdamped": servo.damping < 0.6, "encoders": servo.noise > 0}
+        special = {"underdamped": np.min(servo.damping) < 0.6, "encoders": servo.noise > 0}
         special |= {"sags": np.abs(servo.sag).max() > 0.01}
         words = [name for name, is_so in special.items() if is_so]
         return [*(kinds or ["no faults"]), *words, self.robot, f"{self.rate:g} Hz"]

@@ -178,11 +178,15 @@ def _held(log: Log, ticks: Tick) -> Array:
 
 
 def _mute(log: Log, ticks: Tick) -> Array:
-    """Compute for how long the skill has stood without a word, of its drives' time [s]."""
+    """Compute for how long a robot has stood without a word, of its drives' time [s]."""
     lived = np.cumsum(log.run.drive[: len(ticks.time)])
     passed = ticks.progress - np.interp(lived - STANDS, lived, ticks.progress)
+    last = np.searchsorted(lived, lived - STANDS)
+    moved = np.abs(ticks.reference - ticks.reference[last]).max(-1) > 2e-3
+    stands = (passed < 0.1 * STANDS) & (lived > STANDS)
+    stands &= ~(moved & (ticks.progress >= log.run.situation.skill.end))  # what is last fades
     mute = (ticks.status == "running") | (~ticks.said & (ticks.status != "finished"))
-    return _lasting((passed < 0.1 * STANDS) & (lived > STANDS) & mute, lived)
+    return _lasting(stands & mute, lived)
 
 
 def _arm(log: Log) -> Mask:

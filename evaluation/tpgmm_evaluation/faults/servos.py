@@ -60,9 +60,11 @@ class Servo:
             return (rng.random() < share) * rng.uniform(0, most) * rng.uniform(0, 1, n)
 
         usual = np.exp(rng.uniform(np.log(0.02), np.log(0.4)))
+        lag = np.clip(usual * np.exp(0.2 * rng.standard_normal(n)), 0.02, 0.4)
+        damping = rng.uniform(0.3, 1.3)
         return cls(
-            lag=np.clip(usual * np.exp(0.2 * rng.standard_normal(n)), 0.02, 0.4),
-            damping=rng.uniform(0.3, 1.3),
+            lag=lag * min(1.0, damping),  # what swings is no slower for it
+            damping=damping,
             delay=(rng.random() < 0.5) * rng.uniform(0, 0.06),
             speed=np.minimum(fastest, 10.0) * rng.uniform(0.7, 3.0),
             stiction=some(0.3, 0.04),
