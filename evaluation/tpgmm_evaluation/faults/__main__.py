@@ -23,6 +23,8 @@ from tpgmm_evaluation.faults.measures import Measures, false_status, measure, me
 from tpgmm_evaluation.faults.runs import simulate
 from tpgmm_evaluation.faults.skills import ROBOTS
 
+#: Of loops [Hz].
+RATES = "25,50,100,200,500,1000"
 #: What is printed of a measure of several runs, and what of one run counts as bad.
 COLUMNS: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(("position", "speed", "acceleration", "jerk"), ("sum", 0)),
@@ -82,8 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--run", type=int, metavar="SEED", help="show this run alone")
-    rates = "25,50,100,200,500,1000"
-    parser.add_argument("--rates", default=rates, help="with commas [Hz]")
+    parser.add_argument("--rates", default=RATES, help="with commas [Hz]")
     parser.add_argument("--robots", default=",".join(ROBOTS), help="with commas")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)

@@ -148,9 +148,12 @@ class Servos:
         rubs : float or ndarray of shape (n_robots, n_joints)
             What is added to the friction, of joints that stand and of those that move [rad].
         """
-        soft = np.where(np.isfinite(surface), surface, 0.0)
+        soft = np.where(np.isfinite(surface), surface, 0.0) + np.zeros_like(load)
         yielding, walls = walls, np.where(soft > 0, np.array([[[-np.inf]], [[np.inf]]]), walls)
-        friction = np.stack((self._friction + rubs, self._friction))
+        soft, friction = (
+            np.stack((soft, 0 * soft)),
+            np.stack((self._friction + rubs, self._friction)),
+        )
         lower, upper = (limit + np.zeros_like(load) for limit in self._limits)
         # a wall pushes nobody away
         low = np.minimum(np.stack((np.maximum(walls[0], lower), lower)), self._motor)
@@ -161,8 +164,7 @@ class Servos:
         for _ in range(steps):
             self._now = self._now + h[:, 0]
             gap = self._effective_references() - self._sag - load - self._motor
-            robot = self._motor[0]
-            gap[0] -= soft * (robot - robot.clip(*yielding))
+            gap -= soft * (self._motor - self._motor.clip(*yielding))
             self._speed = free * self._accelerate(gap, h, friction, soft)
             moved = self._motor + h * self._speed
             self._motor = moved.clip(low, high)
@@ -182,7 +184,7 @@ class Servos:
         stands = np.abs(speed) <= STANDING
         way = np.sign(np.where(stands, gap, speed))
         force = self._stiffness * (gap - friction * way)
-        stiffness = self._stiffness * (1 + np.stack((soft, 0 * soft)))
+        stiffness = self._stiffness * (1 + soft)
         new = (speed + h * force) / (1 + h * self._damping + h * h * stiffness)
         stuck = (stands & (np.abs(gap) <= friction)) | (new * way < 0)
         return np.where(stuck & (friction > 0), 0.0, new).clip(-self._fastest, self._fastest)
