@@ -181,12 +181,18 @@ class Progress:
     @property
     def waits(self) -> Flags:
         """Robots that are waited for."""
-        return (self.lasting | (self.mode != RUNNING)) & (self.time < self.end)
+        late = self.off_for >= self._patience
+        return (late | (self.mode != RUNNING)) & (self.time < self.end)
 
     @property
     def lasting(self) -> Flags:
         """Robots that have been off for more than a moment."""
-        return self.off_for > np.maximum(DWELL, 2 * self.usual_dt)
+        return self.off_for > self._patience
+
+    @property
+    def _patience(self) -> Array:
+        """For how long a gap that is not usual means nothing (B,) [s]."""
+        return np.maximum(DWELL, 2 * self.usual_dt)
 
     def advance(self, reference: Array, seen: Seen, find: Find) -> Self:
         """Progress after a tick.
@@ -311,7 +317,7 @@ class Progress:
         stalled = waits & ~stands & ~left & (np.where(known, asked, -1.0) > 0).any(-1)
         off = ~stands & (excess > OFF) | stalled
         now = np.array((servo.reading, servo.expected))
-        return replace_fields(
+        new = replace_fields(
             self,
             time=time,
             rate=rate,
@@ -324,6 +330,16 @@ class Progress:
             rest_bank=np.where(left[:, None], servo.second, self.rest_bank),
             rest_time=np.where(left, time, self.rest_time),
         )
+        slow = known & (np.maximum(servo.excess, servo.lead) > 0.5)
+        return new._slowed(self.off_for, slow, seen.dt, off | stands)
+
+    def _slowed(self, before: Array, slow: Flags, dt: Array, others: Flags) -> Self:
+        """Gaps for which time slows count once they outlast any lag: a robot is waited for."""
+        lag = np.where(slow, self.servo.lag, 0.0).max(-1)
+        share = np.minimum(dt / (RESTART + DWELL + 4 * lag), 1.0)
+        counted = np.minimum(before + share * self._patience, self._patience)
+        rows = slow.any(-1) & ~others
+        return replace_fields(self, off_for=np.where(rows, counted, self.off_for))
 
     def _until_end(self, step: float | Array) -> Array:
         """Time after a step; rounding does not cost a last one."""
