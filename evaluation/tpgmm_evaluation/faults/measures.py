@@ -135,46 +135,43 @@ def false_status(log: Log) -> Mask:
     A robot has to *hold* while readings are impossible for more than 0.3 s; to *wait* (or be
     *displaced*) while it is away from where its servos would be if nothing had disturbed them,
     for longer than they need to come there; to *run* (or be *finished*) while it is there for
-    that long, its readings are right, and no offset or load has changed. Between these, it may
-    have any status, but neither runs while progress stands, nor runs or has finished while a
-    joint is held more than 0.1 rad off, for half a second.
+    that long, nobody holds it, its readings are right, and no offset or load has changed.
+    Between these, it may have any status, but neither runs while progress stands, nor runs or
+    has finished while a joint is held more than 0.1 rad off, for half a second.
     """
     ticks, servo, few = log.ticks, log.run.servo, 2 / log.run.rate
     swings = max(1.0, (0.6 / np.min(servo.damping)) ** 2)
     settle = 0.5 + 2 * (swings * np.max(servo.lag) + servo.delay) + few
     slack = np.max(2 * servo.stiction + servo.backlash) + 3 * servo.noise
     slack += max((fault.size for fault in log.run.faults if fault.kind == "rub"), default=0.0)
-    apart = np.abs(ticks.joints - ticks.shadow).max(-1)
+    apart = np.abs(ticks.joints - ticks.shadow)
     impossible, off = _readings(log, ticks)
+    holds = _holds(log, ticks)
+    running, waiting, ended, holding = (
+        np.isin(ticks.status, names)
+        for names in (("running",), ("waiting", "displaced"), ("finished",), ("holding",))
+    )
     lag = np.abs(ticks.reference - servo.sag - ticks.load - ticks.shadow).max(-1)
     changed = np.abs(np.diff(_offset(log, ticks), axis=0, prepend=0)).max(-1) > 1e-3
-    calm = (apart < 0.01 + slack) & ~off & (lag < 0.1) & ~changed
-    running, waiting, ended = (
-        np.isin(ticks.status, names)
-        for names in (("running",), ("waiting", "displaced"), ("finished",))
-    )
-    holding = ticks.status == "holding"
-    frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
-    held = (_held(log, ticks) > 0.1 + slack).any(-1)
-    wrong = (_mute(log, ticks) > 0.5) | (_lasting(held & (running | ended), ticks.time) > 0.5)
-    wrong &= ~off
+    calm = (apart.max(-1) < 0.01 + slack) & ~off & (lag < 0.1) & ~changed & ~holds.any(-1)
+    held = (apart * holds * _arm(log) > 0.1 + slack).any(-1) & (running | ended)
+    wrong = ((_mute(log, ticks) > 0.5) | (_lasting(held, ticks.time) > 0.5)) & ~off
     wrong |= (_lasting(calm, ticks.time) > settle) & ~(running | ended)
-    arm = np.abs(ticks.joints - ticks.shadow)[:, _arm(log)].max(-1)
     room = 0.1 if any(fault.surface < np.inf for fault in log.run.faults) else 0.03
-    away = _lasting((arm > room + slack) & ~off, ticks.time) > settle
-    wrong = np.where(away, ~waiting, wrong)
+    away = (apart[:, _arm(log)].max(-1) > room + slack) & ~off
+    wrong = np.where(_lasting(away, ticks.time) > settle, ~waiting, wrong)
     lost = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.given > 0)
+    frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
     return np.where(lost, ~(holding | ended | frozen), wrong)
 
 
-def _held(log: Log, ticks: Tick) -> Array:
-    """Compute how far joints that are held are from where they would be [rad]."""
-    apart = np.abs(ticks.joints - ticks.shadow) * _arm(log)
-    held = np.zeros_like(apart)
+def _holds(log: Log, ticks: Tick) -> Mask:
+    """Find joints that are held, dragged or touched, (n_ticks, n_joints)."""
+    held = np.zeros(ticks.joints.shape, dtype=bool)
     for fault in log.run.faults:
         if fault.kind in (*STOPS, "drag", "contact"):
-            held = np.maximum(held, np.outer(fault.active(ticks.time), fault.joints != 0))
-    return apart * held
+            held |= np.outer(fault.active(ticks.time), fault.joints != 0)
+    return held
 
 
 def _mute(log: Log, ticks: Tick) -> Array:
