@@ -191,7 +191,7 @@ class Progress:
 
     @property
     def _patience(self) -> Array:
-        """For how long a gap that is not usual means nothing (B,) [s]."""
+        """Return for how long a gap that is not usual means nothing (B,) [s]."""
         return np.maximum(DWELL, 2 * self.usual_dt)
 
     def advance(self, reference: Array, seen: Seen, find: Find) -> Self:
@@ -331,10 +331,10 @@ class Progress:
             rest_time=np.where(left, time, self.rest_time),
         )
         slow = known & (np.maximum(servo.excess, servo.lead) > 0.5)
-        return new._slowed(self.off_for, slow, seen.dt, off | stands)
+        return new._count_slow(self.off_for, slow, seen.dt, off | stands)
 
-    def _slowed(self, before: Array, slow: Flags, dt: Array, others: Flags) -> Self:
-        """Gaps for which time slows count once they outlast any lag: a robot is waited for."""
+    def _count_slow(self, before: Array, slow: Flags, dt: Array, others: Flags) -> Self:
+        """Count gaps for which time slows: once they outlast any lag, robots are waited for."""
         lag = np.where(slow, self.servo.lag, 0.0).max(-1)
         share = np.minimum(dt / (RESTART + DWELL + 4 * lag), 1.0)
         counted = np.minimum(before + share * self._patience, self._patience)
