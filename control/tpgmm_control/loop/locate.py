@@ -275,12 +275,18 @@ class Progress:
     @property
     def waits(self) -> bool:
         """True while the robot is waited for."""
-        return (self.lasting or self.mode is not Mode.RUNNING) and self.time < self.end
+        late = self.timing.off >= self._patience
+        return (late or self.mode is not Mode.RUNNING) and self.time < self.end
 
     @property
     def lasting(self) -> bool:
         """True while the robot has been off for more than a moment."""
-        return self.timing.off > max(DWELL, 2 * self.timing.usual_dt)
+        return self.timing.off > self._patience
+
+    @property
+    def _patience(self) -> float:
+        """Return for how long a gap that is not usual means nothing [s]."""
+        return max(DWELL, 2 * self.timing.usual_dt)
 
     def advance(self, reference: Array, seen: Seen, find: Find) -> None:
         """Take in what was measured at a tick.
@@ -386,10 +392,20 @@ class Progress:
         if stands:
             timing.off = 0.0
             return
-        off = excess > OFF or (not left and self._stalls(known))
-        timing.off = timing.off + seen.dt if off else 0.0
+        if excess > OFF or (not left and self._stalls(known)):
+            timing.off += seen.dt
+        else:
+            slow = known & (np.maximum(judgement.excess, judgement.lead) > 0.5)
+            timing.off = self._count_slow(slow, seen.dt)
         if excess < 0.5:
             self.followed = Comparison(self.servo.expected, self.servo.readings.median)
+
+    def _count_slow(self, slow: Flags, dt: float) -> float:
+        """Count gaps for which time slows: once they outlast any lag, the robot is waited for."""
+        if not slow.any():
+            return 0.0
+        share = min(dt / (RESTART + DWELL + 4 * float(self.servo.lag[slow].max())), 1.0)
+        return min(self.timing.off + share * self._patience, self._patience)
 
     def _compute_rate(self, gap: float, dt: float) -> float:
         """Compute the rate of time by the largest gap, in units of what is usual."""

@@ -23,11 +23,14 @@ from tpgmm_evaluation.faults.measures import Measures, false_status, measure, me
 from tpgmm_evaluation.faults.runs import simulate
 from tpgmm_evaluation.faults.skills import ROBOTS
 
+#: Of loops [Hz].
+RATES = "25,50,100,200,500,1000"
 #: What is printed of a measure of several runs, and what of one run counts as bad.
 COLUMNS: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(("position", "speed", "acceleration", "jerk"), ("sum", 0)),
-    "step": ("max", np.inf),
-    **dict.fromkeys(("infinite", "raised", "false", "open"), ("sum", 0)),
+    "step": ("max", 1.515),
+    **dict.fromkeys(("infinite", "raised", "false", "open", "stuck"), ("sum", 0)),
+    "mute": ("max", 0.5),
     "late": ("max", 1),
     "gap": ("max", 0.05),
     "runaway": ("max", 0.05),
@@ -37,13 +40,15 @@ COLUMNS: Mapping[str, tuple[str, float]] = {
 def _table(found: Sequence[tuple[Run, Measures]]) -> str:
     """Tabulate measures in a row for each kind of fault, and for all runs."""
     runs = pd.DataFrame([measures for _, measures in found])
-    kinds = [sorted({fault.kind for fault in run.faults}) or ["no faults"] for run, _ in found]
+    kinds = [run.labels for run, _ in found]
     by_kind = runs.assign(kind=kinds).explode("kind").groupby("kind")
-    lines = [f"{'':12}{'runs':>6}{'true %':>8}" + "".join(f"{name:>13}" for name in COLUMNS)]
+    head = f"{'':13}{'runs':>5}{'true %':>8}{'ends %':>8}"
+    lines = [head + "".join(f"{name[:8]:>9}" for name in COLUMNS)]
     for kind, rows in [*by_kind, ("all", runs)]:
-        cells = [f"{rows[name].agg(how):13.4g}" for name, (how, _) in COLUMNS.items()]
+        cells = [f"{rows[name].agg(how):9.3g}" for name, (how, _) in COLUMNS.items()]
         true = 100 - 100 * rows["false"].sum() / rows.ticks.sum()
-        lines.append(f"{kind:12}{len(rows):6}{true:8.2f}{''.join(cells)}")
+        ends = 100 * rows.ended.mean()
+        lines.append(f"{kind:13}{len(rows):5}{true:8.2f}{ends:8.1f}{''.join(cells)}")
     return "\n".join(lines)
 
 
@@ -79,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--run", type=int, metavar="SEED", help="show this run alone")
-    parser.add_argument("--rates", default="50", help="with commas [Hz]")
+    parser.add_argument("--rates", default=RATES, help="with commas [Hz]")
     parser.add_argument("--robots", default=",".join(ROBOTS), help="with commas")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)

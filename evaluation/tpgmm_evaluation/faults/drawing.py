@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,9 @@ Array = NDArray[np.float64]
 #: Of the seeds; constants are chosen on the first one alone.
 HALVES = ("development", "held-out")
 #: How much longer than its skill a run may be [s].
-GRACE = 8.0
+GRACE = 10.0
+#: Durations that a tick may have, in usual ones, and memory of these in ticks.
+LONGEST, MEMORY = 1.5, 10
 
 
 @dataclass
@@ -34,6 +36,8 @@ class Fault:
         In the unit of the kind.
     kept : ndarray, optional
         What was found when it began.
+    surface : float
+        Stiffness of what is touched, in units of the drives'.
     """
 
     kind: str
@@ -42,10 +46,12 @@ class Fault:
     joints: Array
     size: float = 1.0
     kept: Array | None = None
+    surface: float = np.inf
 
     def __str__(self) -> str:
-        joints = np.flatnonzero(self.joints).tolist()
-        return f"{self.kind} {self.size:.3g} of {joints}, {self.begin:.2f} to {self.end:.2f} s"
+        joints, size = np.flatnonzero(self.joints).tolist(), f"{self.size:.3g}"
+        on = f" on {self.surface:.2g}" if self.surface < np.inf else ""
+        return f"{self.kind} {size}{on} of {joints}, {self.begin:.2f} to {self.end:.2f} s"
 
     def active(self, time: Array | float) -> NDArray[np.bool_]:
         """Return whether it lasts at these times."""
@@ -92,19 +98,25 @@ KINDS: Mapping[str, tuple[float, float, float, float]] = {
     "units": (-1, 1, 1.5, 1.0),  # degrees, or radians taken for degrees
     "flipped": (1, 1, 1.5, 0.5),
     "outliers": (0.05, 1.0, np.inf, 0.0),  # rad
-    "stall": (-0.3, 1.0, 0.1, 1.0),  # s; if negative, the controller does not get it
+    "stall": (-0.3, 0.9, 3.0, 1.0),  # s, each second; if negative, the controller is not told
     "jitter": (0.1, 0.8, np.inf, 1.0),  # standard deviation of the logarithm of dt
     "clock": (0.02, 0.2, 1.5, 1.0),  # share of ticks whose dt is 0, negative or NaN
     "payload": (0.05, 0.35, np.inf, 0.0),  # rad
+    "rub": (0.02, 0.1, np.inf, 0.0),  # rad, friction of a joint on both its sides
     "stop": (1, 1, 3.0, 0.7),
+    "hold": (1, 1, 6.0, 0.0),
+    "block": (1, 1, np.inf, 0.0),
+    "drag": (0.1, 0.6, 3.0, 0.0),  # rad
     "push": (-2, 2, 0.5, 1.0),  # s along the undisturbed path
     "teleport": (0.05, 0.4, 0.1, 0.7),  # rad
-    "contact": (0.02, 0.1, 2.0, 0.0),  # rad before where a joint would come to
+    "contact": (0.02, 0.2, 6.0, 0.0),  # rad before where a joint would come to
     "grasp": (0.3, 1.2, 2.0, 0.0),  # the same of the last one, a gripper
     "pose lost": (1, 1, 2.0, 1.0),
     "pose noise": (0.001, 0.01, np.inf, 1.0),  # m, and three times that in quaternions
     "pose flipped": (1, 1, 2.0, 1.0),
 }
+#: Joints that do not move; what takes the time of a skill.
+STOPS = ("stop", "hold", "block")
 #: What is seen of a pose (7,), position and quaternion.
 POSES: Mapping[str, Callable[[Array, Fault, np.random.Generator], Array]] = {
     "pose lost": lambda pose, fault, rng: np.full(7, np.nan),
@@ -157,8 +169,9 @@ class Run:
         for fault in self.faults:
             inside = fault.active(now)
             if fault.kind == "stall":
-                stall = np.flatnonzero(now >= fault.begin)[:1]
-                self.true[stall] += abs(fault.size)
+                stall = np.searchsorted(now, np.arange(fault.begin, fault.end + 1e-9))
+                stall = stall[stall < n]
+                self.true[stall] += max(0.1, abs(fault.size))
                 unnoticed[stall] = fault.size < 0
             elif fault.kind == "jitter":
                 factor = np.exp(fault.size * rng.standard_normal(n)).clip(0.2, 5)
@@ -167,6 +180,27 @@ class Run:
                 wrong |= inside & (rng.random(n) < fault.size)
         self.given = np.where(unnoticed, usual, self.true)
         self.given[wrong] = rng.choice([0, -usual, np.nan], wrong.sum())
+
+    @property
+    def labels(self) -> Sequence[str]:
+        """Faults, what is special in its servo, robot and rate, in words."""
+        servo, kinds = self.servo, sorted({fault.kind for fault in self.faults})
+        special = {"underdamped": np.min(servo.damping) < 0.6, "encoders": servo.noise > 0}
+        special |= {"sags": np.abs(servo.sag).max() > 0.01}
+        words = [name for name, is_so in special.items() if is_so]
+        return [*(kinds or ["no faults"]), *words, self.robot, f"{self.rate:g} Hz"]
+
+    @property
+    def drive(self) -> Array:
+        """Durations in which references may move (n_ticks,): a loop that stood is no licence.
+
+        At most 1.5 usual ones [s], of which each tick counts at most twice.
+        """
+        usual, found = 1 / self.rate, []
+        for dt in np.where(self.given > 0, self.given, 0.0):
+            found.append(min(dt, LONGEST * usual))
+            usual += (dt > 0) * (min(dt, 2 * usual) - usual) / MEMORY
+        return np.array(found)
 
     @property
     def situation(self) -> Scenario:
@@ -189,6 +223,9 @@ class Run:
         number = int(rng.integers(len(situations(robot))))
         situation = situations(robot)[number]
         servo = Servo.draw(rng, situation.limits[2])
+        shown = situation.skill.command_gaps(np.array([situation.skill.begin]))
+        if shown is not None:  # drives as in the demonstrations, or nearly so
+            servo = replace(servo, sag=shown[0][0] * rng.uniform(0.7, 1.3))
         faults = [_draw(rng, situation) for _ in range(rng.choice([0, 1, 1, 1, 2, 3]))]
         # offsets and noise before what replaces readings
         faults.sort(key=lambda fault: (list(KINDS).index(fault.kind), fault.begin))
@@ -199,11 +236,15 @@ def _draw(rng: np.random.Generator, situation: Scenario) -> Fault:
     """Draw any fault, some time in the skill."""
     kind, n = str(rng.choice(list(KINDS))), len(situation.joints)
     least, most, longest, share = KINDS[kind]
-    begin, lasting = rng.uniform(0.2, situation.skill.end), rng.uniform(0.05, min(longest, 3.0))
+    begin = rng.uniform(0.2, situation.skill.end)
+    lasting = rng.uniform(0.05, longest if longest < np.inf else 3.0)
     if longest == np.inf and rng.random() < 0.5:
         lasting = np.inf
     several = n if rng.random() < share else min(n, 1 + (kind == "swapped"))
     chosen = np.array([n - 1]) if kind == "grasp" else rng.choice(n, several, replace=False)
     joints = np.zeros(n)
     joints[chosen] = rng.choice([-1, 1], len(chosen))
-    return Fault(kind, begin, begin + lasting, joints, rng.uniform(least, most))
+    fault = Fault(kind, begin, begin + lasting, joints, rng.uniform(least, most))
+    if kind == "contact" and rng.random() < 0.5:
+        fault.surface = np.exp(rng.uniform(np.log(0.3), np.log(30)))
+    return fault

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
+from tpgmm_evaluation.faults.drawing import KINDS, POSES, STOPS, Run
 from tpgmm_evaluation.faults.runs import Log, Tick, simulate
 from tpgmm_evaluation.processes import call_all
 
@@ -20,6 +20,8 @@ Mask = NDArray[np.bool_]
 Measures = Mapping[str, float]
 #: Share by which rounding may exceed a bound.
 ROOM = 1.01
+#: Time in which a skill that goes on has gone on [s].
+STANDS = 0.2
 #: Robots whose servos are simulated together.
 TOGETHER = 16
 
@@ -50,43 +52,52 @@ def measure(log: Log) -> Measures:
     -------
     mapping of str to float
         ``ticks``; ticks beyond ``position``, ``speed``, ``acceleration`` and ``jerk``, over
-        the durations that were given, ``infinite`` ones, and those with a ``false`` status;
-        ``step``, the greatest speed in units of its bound; ``raised``, whether there was an
-        exception; ``open``, whether it neither finished, nor waits at last and names a joint,
-        nor is held for readings that last; ``late``, seconds after the skill and all
-        interruptions; ``gap``, between reference and joints while stopped, on top of what it
-        was at that moment or would be with its lag [rad]; ``runaway``, the distance of the
-        reference from the undisturbed path, on top of 1.5 times what readings, sag and load
-        are off [rad]. What does not apply is NaN.
+        the durations in which references may move (:attr:`Run.drive`), ``infinite`` ones, and
+        those with a ``false`` status; ``step``, the largest change in units of what its bound
+        allows in a usual period; ``raised``, whether there was an exception; ``ended``;
+        ``open``, whether it neither finished, nor waits at last and names a joint, nor is held
+        for readings that last; ``stuck``, whether it did not finish with nothing in its way;
+        ``mute``, for how long its status was running or its reason empty while it stood [s];
+        ``late``, seconds after the skill and all interruptions; ``gap``, between reference and
+        joints while stopped, on top of what it was at that moment or would be with its lag
+        [rad]; ``runaway``, the distance of the reference from the undisturbed path, on top of
+        1.5 times what readings, sag and load are off [rad]. What does not apply is NaN.
     """
-    ticks, at = log.ticks, log.run.situation
+    ticks, at, done = log.ticks, log.run.situation, log.done < np.inf
+    moved = np.diff(ticks.reference, axis=0) * log.run.rate / at.limits[2]
     low, high = at.limits[0] - 1e-9, at.limits[1] + 1e-9
-    rates = _rates(ticks, at.joints, at.limits[2:])
+    drive = log.run.drive[: len(ticks.time)]
+    rates = _rates(ticks.reference, drive, at.joints, at.limits[2:])
     beyond = [float((rate > ROOM).sum()) for rate in rates]
     return {
         "ticks": len(ticks.time),
         "position": float(((ticks.reference < low) | (ticks.reference > high)).any(-1).sum()),
         **dict(zip(("speed", "acceleration", "jerk"), beyond, strict=True)),
-        "step": float(np.nanmax(rates[0], initial=0)),
+        "step": float(np.nanmax(np.abs(moved), initial=0)),
         "infinite": float((~np.isfinite(ticks.reference)).any(-1).sum()),
         "raised": float(bool(log.error)),
         "false": float(false_status(log).sum()),
+        "ended": float(done and not log.error),
         "open": float(_open(log, ticks)),
+        "stuck": float(not done and all(f.end < ticks.time[-1] - 4 for f in log.run.faults)),
+        "mute": float(_mute(log, ticks).max()),
         "late": _late(log, ticks),
         "gap": _gap(log, ticks),
         "runaway": _runaway(log, ticks),
     }
 
 
-def _rates(ticks: Tick, start: Array, limits: tuple[Array, ...]) -> list[Array]:
+def _rates(
+    references: Array, drive: Array, start: Array, limits: tuple[Array, ...]
+) -> list[Array]:
     """Compute speed, acceleration and jerk of each tick, in units of their limits."""
-    timed = ticks.given > 0  # false where it is not a number
-    reference = np.concatenate((start[None], ticks.reference))
+    timed = drive > 0
+    reference = np.concatenate((start[None], references))
     jumped = (np.diff(reference, axis=0)[~timed] != 0).any(-1)  # in no time
-    dt = ticks.given[timed]
+    dt = drive[timed]
     before = np.concatenate((dt[:1], dt[:-1]))
     earlier = np.concatenate((before[:1], before[:-1]))
-    change = np.diff(np.concatenate((start[None], ticks.reference[timed])), axis=0)
+    change = np.diff(np.concatenate((start[None], references[timed])), axis=0)
     rates = []
     for span, limit in zip(
         (dt, (dt + before) / 2, (dt + before + earlier) / 3), limits, strict=True
@@ -124,34 +135,55 @@ def false_status(log: Log) -> Mask:
     A robot has to *hold* while readings are impossible for more than 0.3 s; to *wait* (or be
     *displaced*) while it is away from where its servos would be if nothing had disturbed them,
     for longer than they need to come there; to *run* (or be *finished*) while it is there for
-    that long, its readings are right, and no offset or load has changed. Between these, it may
-    have any status but that it runs while progress stands for a second.
+    that long, nobody holds it, its readings are right, and no offset or load has changed.
+    Between these, it may have any status, but neither runs while progress stands, nor runs or
+    has finished while a joint is held more than 0.1 rad off, for half a second.
     """
     ticks, servo, few = log.ticks, log.run.servo, 2 / log.run.rate
-    settle = 0.5 + 2 * (np.max(servo.lag) + servo.delay) + few
-    slack = np.max(2 * servo.stiction + servo.backlash)
-    apart = np.abs(ticks.joints - ticks.shadow).max(-1)
+    swings = max(1.0, (0.6 / np.min(servo.damping)) ** 2)
+    settle = 0.5 + 2 * (swings * np.max(servo.lag) + servo.delay) + few
+    slack = np.max(2 * servo.stiction + servo.backlash) + 3 * servo.noise
+    slack += max((fault.size for fault in log.run.faults if fault.kind == "rub"), default=0.0)
+    apart = np.abs(ticks.joints - ticks.shadow)
     impossible, off = _readings(log, ticks)
+    holds = _holds(log, ticks)
+    running, waiting, ended, holding = (
+        np.isin(ticks.status, names)
+        for names in (("running",), ("waiting", "displaced"), ("finished",), ("holding",))
+    )
     lag = np.abs(ticks.reference - servo.sag - ticks.load - ticks.shadow).max(-1)
     changed = np.abs(np.diff(_offset(log, ticks), axis=0, prepend=0)).max(-1) > 1e-3
-    calm = (apart < 0.01 + slack) & ~off & (lag < 0.1) & ~changed
-    stands = ticks.time > 1
-    for seconds in (1.0, 0.3):
-        before = np.interp(ticks.time - seconds, ticks.time, ticks.progress)
-        stands &= ticks.progress - before < 0.1 * seconds
-    running, waiting, ended = (
-        np.isin(ticks.status, names)
-        for names in (("running",), ("waiting", "displaced"), ("finished",))
-    )
-    holding = ticks.status == "holding"
-    frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
-    wrong = (_lasting(running, ticks.time) > 0.3) & stands & ~off
+    calm = (apart.max(-1) < 0.01 + slack) & ~off & (lag < 0.1) & ~changed & ~holds.any(-1)
+    held = (apart * holds * _arm(log) > 0.1 + slack).any(-1) & (running | ended)
+    wrong = ((_mute(log, ticks) > 0.5) | (_lasting(held, ticks.time) > 0.5)) & ~off
     wrong |= (_lasting(calm, ticks.time) > settle) & ~(running | ended)
-    arm = np.abs(ticks.joints - ticks.shadow)[:, _arm(log)].max(-1)
-    away = _lasting((arm > 0.03 + slack) & ~off, ticks.time) > settle
-    wrong = np.where(away, ~waiting, wrong)
-    held = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.given > 0)
-    return np.where(held, ~(holding | ended | frozen), wrong)
+    room = 0.1 if any(fault.surface < np.inf for fault in log.run.faults) else 0.03
+    away = (apart[:, _arm(log)].max(-1) > room + slack) & ~off
+    wrong = np.where(_lasting(away, ticks.time) > settle, ~waiting, wrong)
+    lost = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.given > 0)
+    frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
+    return np.where(lost, ~(holding | ended | frozen), wrong)
+
+
+def _holds(log: Log, ticks: Tick) -> Mask:
+    """Find joints that are held, dragged or touched, (n_ticks, n_joints)."""
+    held = np.zeros(ticks.joints.shape, dtype=bool)
+    for fault in log.run.faults:
+        if fault.kind in (*STOPS, "drag", "contact"):
+            held |= np.outer(fault.active(ticks.time), fault.joints != 0)
+    return held
+
+
+def _mute(log: Log, ticks: Tick) -> Array:
+    """Compute for how long a robot has stood without a word, of its drives' time [s]."""
+    lived = np.cumsum(log.run.drive[: len(ticks.time)])
+    passed = ticks.progress - np.interp(lived - STANDS, lived, ticks.progress)
+    last = np.searchsorted(lived, lived - STANDS)
+    moved = np.abs(ticks.reference - ticks.reference[last]).max(-1) > 2e-3
+    stands = (passed < 0.1 * STANDS) & (lived > STANDS)
+    stands &= ~(moved & (ticks.progress >= log.run.situation.skill.end))  # what is last fades
+    mute = (ticks.status == "running") | (~ticks.said & (ticks.status != "finished"))
+    return _lasting(stands & mute, lived)
 
 
 def _arm(log: Log) -> Mask:
@@ -192,7 +224,7 @@ def _gap(log: Log, ticks: Tick) -> float:
     usual = np.abs(ticks.reference - ticks.shadow)
     for fault in log.run.faults:
         inside = np.flatnonzero(fault.active(ticks.time))
-        if fault.kind == "stop" and len(inside):
+        if fault.kind in STOPS and len(inside):
             before = gap[max(0, inside[0] - 1)]
             usual[inside] = np.maximum.accumulate(np.maximum(usual[inside], before))
             grown = gap[inside] - usual[inside]

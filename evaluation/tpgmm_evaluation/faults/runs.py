@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_control.loop.controller import Controller
-from tpgmm_evaluation.faults.drawing import POSES, READINGS, Fault, Run
+from tpgmm_evaluation.faults.drawing import POSES, READINGS, STOPS, Fault, Run
 from tpgmm_evaluation.faults.servos import Servos
 from tpgmm_evaluation.faults.skills import PATH_RATE
 
 Array = NDArray[np.float64]
 #: Seconds for which a robot is looked at after it has finished.
-AFTER_END = 0.3
+AFTER_END = 1.0
 
 
 class Tick(NamedTuple):
@@ -24,8 +24,8 @@ class Tick(NamedTuple):
 
     ``joints`` and ``shadow`` are those of the servos, and of servos that follow the same
     references undisturbed; ``expected`` is read by sensors that have an offset and noise at
-    most, ``reading`` is what the controller was given; ``progress`` [s] and ``status`` are its
-    answer.
+    most, ``reading`` is what the controller was given; ``progress`` [s], ``status`` and
+    whether a reason was ``said`` are its answer.
     """
 
     given: Any
@@ -38,6 +38,7 @@ class Tick(NamedTuple):
     reading: Any
     progress: Any
     status: Any
+    said: Any
 
 
 @dataclass(eq=False)
@@ -94,7 +95,8 @@ class Log:
         self.reference, self.reason = command.reference.numpy(), command.reason()
         self.done = min(self.done, now if self._controller.finished else np.inf)
         ours = self.reference, joints[0], joints[1], load, expected
-        answer = self.reading, float(command.time), str(command.status)
+        said = bool(self.reason)
+        answer = self.reading, float(command.time), str(command.status), said
         self.rows.append(Tick(given, now, *ours, *answer))
 
 
@@ -126,7 +128,8 @@ def simulate(runs: Sequence[Run]) -> list[Log]:
 def _read(run: Run, joints: Array, last: Array, now: float) -> tuple[Array, Array]:
     """Read joints with an offset and noise at most, and with all faults."""
     step = run.servo.resolution
-    expected = reading = np.round(joints / step) * step
+    noisy = joints + run.servo.noise * run.rng.standard_normal(len(joints))
+    expected = reading = np.round(noisy / step) * step
     for fault in run.faults:
         if fault.kind in READINGS and fault.active(now):
             reading = READINGS[fault.kind](reading, fault, last, run.rng)
@@ -151,41 +154,50 @@ def _seen(run: Run, now: float) -> Mapping[str, Array] | None:
 def _disturb(runs: Sequence[Run], now: Array, servos: Servos, dt: Array) -> Array:
     """Advance the servos by a tick, disturbed by somebody; return the loads."""
     shape = servos.joints.shape[1:]
-    held, load = np.zeros(shape, dtype=bool), np.zeros(shape)
+    held, (load, rubs) = np.zeros(shape, dtype=bool), np.zeros((2, *shape))
+    surface = np.full(shape, np.inf)
     walls = np.stack((np.full(shape, -np.inf), np.full(shape, np.inf)))
     for i, run in enumerate(runs):
         for fault in run.faults:
             if fault.kind == "payload":
                 load[i] += fault.size * fault.joints * fault.active(now[i])
-            elif fault.kind == "stop":
+            elif fault.kind == "rub":
+                rubs[i] += fault.size * np.abs(fault.joints) * fault.active(now[i])
+            elif fault.kind in STOPS:
                 held[i] |= (fault.joints != 0) & fault.active(now[i])
             elif fault.kind in ("contact", "grasp") and fault.active(now[i]):
-                _block(run, fault, walls[:, i])
-            elif fault.kind in ("push", "teleport") and fault.active(now[i]):
-                servos.place(i, _carry(run, fault, servos.joints[0, i], now[i]))
-                held[i] = True
-    servos.advance(dt, held, load, walls)
+                _block(run, fault, walls[:, i], servos.joints[0, i])
+                surface[i][fault.joints != 0] = fault.surface
+            elif fault.kind in ("push", "teleport", "drag") and fault.active(now[i]):
+                moved = (fault.joints != 0) | (fault.kind != "drag")
+                servos.place(i, _carry(run, fault, servos.joints[0, i], now[i]), moved)
+                held[i] |= moved
+    servos.advance(dt, held, load, walls, surface, rubs)
     return load
 
 
-def _block(run: Run, fault: Fault, walls: Array) -> None:
-    """Put a wall before where a joint would come to in the meantime."""
+def _block(run: Run, fault: Fault, walls: Array, joints: Array) -> None:
+    """Put a wall before where a joint would come to in the meantime; it pushes nobody away."""
+    fault.kept = joints if fault.kept is None else fault.kept
     [joint] = np.flatnonzero(fault.joints)
     part = run.situation.path[:, joint]
     part = part[int(fault.begin * PATH_RATE) : int(min(fault.end, 100) * PATH_RATE)]
     if len(part) and fault.joints[joint] > 0:
-        walls[1, joint] = part.max() - fault.size
+        walls[1, joint] = max(part.max() - fault.size, fault.kept[joint])
     elif len(part):
-        walls[0, joint] = part.min() + fault.size
+        walls[0, joint] = min(part.min() + fault.size, fault.kept[joint])
 
 
 def _carry(run: Run, fault: Fault, joints: Array, now: float) -> Array:
-    """Carry a robot: at once to anywhere, or along its way."""
+    """Carry a robot: at once to anywhere, a joint slowly, or all of them along their way."""
     path = run.situation.path
     if fault.kept is None:
         fault.kept = joints
     if fault.kind == "teleport":
         return fault.kept + fault.size * fault.joints
-    goal = path[int(np.clip((fault.begin + fault.size) * PATH_RATE, 0, len(path) - 1))]
     share = min(1.0, 2 * (now - fault.begin) / (fault.end - fault.begin))
+    if fault.kind == "drag":
+        low, high = run.situation.limits[:2]
+        return (fault.kept + share * fault.size * fault.joints).clip(low, high)
+    goal = path[int(np.clip((fault.begin + fault.size) * PATH_RATE, 0, len(path) - 1))]
     return fault.kept + share * (goal - fault.kept)

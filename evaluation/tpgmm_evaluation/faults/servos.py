@@ -36,8 +36,8 @@ class Servo:
         Play between the motor and the joint [rad].
     sag : float or ndarray
         How far a joint stays below its reference [rad].
-    resolution : float
-        Of the readings [rad].
+    resolution, noise : float
+        Of the readings; the latter is a standard deviation [rad].
     """
 
     lag: float | Array = 0.08
@@ -48,6 +48,7 @@ class Servo:
     backlash: float | Array = 0.0
     sag: float | Array = 0.0
     resolution: float = 1e-9
+    noise: float = 0.0
 
     @classmethod
     def draw(cls, rng: np.random.Generator, fastest: Array) -> Self:
@@ -59,15 +60,18 @@ class Servo:
             return (rng.random() < share) * rng.uniform(0, most) * rng.uniform(0, 1, n)
 
         usual = np.exp(rng.uniform(np.log(0.02), np.log(0.4)))
+        lag = np.clip(usual * np.exp(0.2 * rng.standard_normal(n)), 0.02, 0.4)
+        damping = rng.uniform(0.3, 1.3)
         return cls(
-            lag=np.clip(usual * np.exp(0.2 * rng.standard_normal(n)), 0.02, 0.4),
-            damping=rng.uniform(0.6, 1.3),
+            lag=lag * min(1.0, damping),  # what swings is no slower for it
+            damping=damping,
             delay=(rng.random() < 0.5) * rng.uniform(0, 0.06),
             speed=np.minimum(fastest, 10.0) * rng.uniform(0.7, 3.0),
             stiction=some(0.3, 0.04),
             backlash=some(0.3, 0.01),
             sag=some(0.4, 0.1) * rng.choice([-1, 1], n),
             resolution=rng.choice([1e-9, 2 * np.pi / 4096]),
+            noise=(rng.random() < 0.3) * np.exp(rng.uniform(np.log(5e-4), np.log(0.015))),
         )
 
 
@@ -113,12 +117,20 @@ class Servos:
         self._last += 1
         self._sent[self._last], self._references[self._last] = self._now, references
 
-    def place(self, robot: int, joints: Array) -> None:
-        """Put a robot somewhere else; its shadow stays."""
-        self._motor[0, robot] = self.joints[0, robot] = joints
-        self._speed[0, robot] = 0
+    def place(self, robot: int, joints: Array, moved: NDArray[np.bool_]) -> None:
+        """Put some joints (n_joints,) of a robot somewhere else; its shadow stays."""
+        self._motor[0, robot, moved] = self.joints[0, robot, moved] = joints[moved]
+        self._speed[0, robot, moved] = 0
 
-    def advance(self, dt: Array, held: NDArray[np.bool_], load: Array, walls: Array) -> None:
+    def advance(
+        self,
+        dt: Array,
+        held: NDArray[np.bool_],
+        load: Array,
+        walls: Array,
+        surface: Array | float = np.inf,
+        rubs: Array | float = 0.0,
+    ) -> None:
         """Let some time pass for each robot.
 
         Parameters
@@ -131,7 +143,17 @@ class Servos:
             What is added to the sag.
         walls : ndarray of shape (2, n_robots, n_joints)
             Between which the joints stay.
+        surface : float or ndarray of shape (n_robots, n_joints)
+            Stiffness of the walls, in units of the drives'.
+        rubs : float or ndarray of shape (n_robots, n_joints)
+            What is added to the friction, of joints that stand and of those that move [rad].
         """
+        soft = np.where(np.isfinite(surface), surface, 0.0) + np.zeros_like(load)
+        yielding, walls = walls, np.where(soft > 0, np.array([[[-np.inf]], [[np.inf]]]), walls)
+        soft, friction = (
+            np.stack((soft, 0 * soft)),
+            np.stack((self._friction + rubs, self._friction)),
+        )
         lower, upper = (limit + np.zeros_like(load) for limit in self._limits)
         # a wall pushes nobody away
         low = np.minimum(np.stack((np.maximum(walls[0], lower), lower)), self._motor)
@@ -142,7 +164,8 @@ class Servos:
         for _ in range(steps):
             self._now = self._now + h[:, 0]
             gap = self._effective_references() - self._sag - load - self._motor
-            self._speed = free * self._accelerate(gap, h)
+            gap -= soft * (self._motor - self._motor.clip(*yielding))
+            self._speed = free * self._accelerate(gap, h, friction, soft)
             moved = self._motor + h * self._speed
             self._motor = moved.clip(low, high)
             self._speed = self._speed * (moved == self._motor)
@@ -155,12 +178,13 @@ class Servos:
             self._effective = self._effective + due
         return self._references[self._effective, self._robots]
 
-    def _accelerate(self, gap: Array, h: Array) -> Array:
+    def _accelerate(self, gap: Array, h: Array, friction: Array, soft: Array) -> Array:
         """Compute speeds after a step, implicitly, so that no step is too long."""
-        friction, speed = self._friction, self._speed
+        speed = self._speed
         stands = np.abs(speed) <= STANDING
         way = np.sign(np.where(stands, gap, speed))
         force = self._stiffness * (gap - friction * way)
-        new = (speed + h * force) / (1 + h * self._damping + h * h * self._stiffness)
+        stiffness = self._stiffness * (1 + soft)
+        new = (speed + h * force) / (1 + h * self._damping + h * h * stiffness)
         stuck = (stands & (np.abs(gap) <= friction)) | (new * way < 0)
         return np.where(stuck & (friction > 0), 0.0, new).clip(-self._fastest, self._fastest)

@@ -60,8 +60,13 @@ def _rise(share: Any) -> Any:
     return (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
 
 
-def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstration]]:
-    """Let joints about these axes reach a cup, rest while a gripper closes, and leave."""
+def _arm(
+    axes: str, gripper: bool = False, sag: float = 0.0
+) -> tuple[Model, Sequence[Demonstration]]:
+    """Let joints about these axes reach a cup, rest while a gripper closes, and leave.
+
+    With ``sag`` [rad], demonstrations hold commands of drives that sag, and are 0.1 s late.
+    """
     text = ['<robot name="arm"><link name="base"/>']
     links = ["base", *range(1, len(axes)), "hand"]
     for number, axis in enumerate(axes, 1):
@@ -87,9 +92,14 @@ def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstratio
             joints = np.hstack((joints, 2 * _rise((time - 2.1) / 0.8) - 1))
         at_cup = np.append(there, np.zeros(len(coordinates)))
         cup = Frame(robot.state(torch.from_numpy(at_cup)).position("hand"))
+        sags = sag * (-0.5) ** np.arange(joints.shape[1])
+        commands = joints + 0.1 * np.gradient(joints, time, axis=0) + sags
         shown.append(
-            Demonstration(torch.from_numpy(time), joints, {"cup": cup}, robot.joint_names)
-        )
+            Demonstration(
+                torch.from_numpy(time), joints, {"cup": cup}, robot.joint_names,
+                commands=commands if sag else None,
+            )
+        )  # fmt: skip
     operators = [RelativePosition("hand", "cup"), Canonical()]
     return Model(8, operators, robot).fit(shown), shown
 
@@ -106,6 +116,7 @@ ROBOTS: Mapping[str, Callable[[], tuple[Model, Sequence[Demonstration]]]] = {
     "four joints": partial(_arm, "zzzx"),
     "seven joints": partial(_arm, "zyxyxyx"),
     "gripper": partial(_arm, "yy", gripper=True),
+    "sagging": partial(_arm, "zzzx", sag=0.08),
     "upper body": _upper_body,
 }
 

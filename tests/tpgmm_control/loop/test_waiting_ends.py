@@ -14,6 +14,23 @@ from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.regression.posture import PostureSearch
 
 
+@pytest.mark.parametrize("hertz", [25, 50, 200])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_time_does_not_creep_on_in_silence_while_a_joint_is_held(hertz, joint):
+    run, silent = begin(lag=0.025), 0
+
+    def held(error, speed):
+        return error * np.eye(4)[joint] * (float(run.controller.time) > 0.5)
+
+    for _ in range(2 * hertz):
+        before = float(run.controller.time)
+        command = run.tick(1 / hertz, rubs=held)
+        slow = float(run.controller.time) - before < 0.5 / hertz
+        silent += slow and str(command.status) == "running"
+    assert silent / hertz < 0.4
+    assert str(command.status) == "waiting"
+
+
 @pytest.mark.parametrize("noise", [0.0005, 0.004, 0.015])
 @pytest.mark.parametrize("holds", [False, True])
 def test_a_stop_ends_whatever_the_noise(holds, noise):
