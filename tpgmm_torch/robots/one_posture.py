@@ -4,6 +4,7 @@ The same bodies as :mod:`~tpgmm_torch.robots.forward_kinematics` has for batches
 numpy takes half the time that torch takes. Orientations are read from the matrices of poses.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -88,27 +89,32 @@ class OnePosture:
         np.multiply(axes[:3], self._turns, out=pairs[:, 1])
         if self._slides is not None:
             pairs[:, 0] += axes[:3] * self._slides
-        if self._mimic is not None:
-            rows = rows @ self._mimic
-        return place[:, :3], _quaternions(numbers.take(self._turned)), rows
+        turned = _quaternions(numbers.take(self._turned))
+        return place[:, :3], turned, rows if self._mimic is None else rows @ self._mimic
 
 
-#: ``4 eps eps^T`` is linear in a rotation matrix; of its rows the longest has most digits.
-SQUARES = np.zeros((9, 4, 4))
-SQUARES[[0, 4, 8], 0, 0] = 1.0
-SQUARES[0, [1, 2, 3], [1, 2, 3]] = 1.0, -1.0, -1.0
-SQUARES[4, [1, 2, 3], [1, 2, 3]] = -1.0, 1.0, -1.0
-SQUARES[8, [1, 2, 3], [1, 2, 3]] = -1.0, -1.0, 1.0
-SQUARES[[7, 5, 2, 6, 3, 1], 0, [1, 1, 2, 2, 3, 3]] = 1.0, -1.0, 1.0, -1.0, 1.0, -1.0
-SQUARES[[1, 3, 2, 6, 5, 7], [1, 1, 1, 1, 2, 2], [2, 2, 3, 3, 3, 3]] = 1.0
-SQUARES += np.triu(SQUARES, 1).swapaxes(1, 2)
-SQUARES = SQUARES.reshape(9, 16)
+def _tabulate_squares() -> Array:
+    """Tabulate ``4 eps eps^T - I``, linear in a rotation matrix: (9, 16)."""
+    found = np.zeros((9, 4, 4))
+    found[[0, 4, 8], 0, 0] = 1.0
+    axes = np.eye(3)
+    for i in range(3):
+        found[[0, 4, 8], i + 1, i + 1] = 2 * axes[i] - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        found[[3 * k + j, 3 * j + k], 0, i + 1] = 1.0, -1.0
+        found[[3 * i + j, 3 * j + i], min(i, j) + 1, max(i, j) + 1] = 1.0
+    return np.asarray((found + np.triu(found, 1).swapaxes(1, 2)).reshape(9, 16))
+
+
+SQUARES, EYE = _tabulate_squares(), np.eye(4).ravel()
 
 
 def _quaternions(matrices: Array) -> Array:
     """Unit quaternions (L, 4) of rotation matrices (L, 9)."""
-    squares = (matrices @ SQUARES + np.eye(4).ravel()).reshape(-1, 4, 4)
-    longest = squares[:, [0, 1, 2, 3], [0, 1, 2, 3]].argmax(1)
-    found = squares[np.arange(len(squares)), longest]
-    norms = np.sqrt(np.einsum("ij,ij->i", found, found))
-    return np.asarray(found / np.copysign(norms, found[:, 0])[:, None])
+    found = []
+    for squares in (matrices @ SQUARES + EYE).tolist():  # of few numbers Python is faster
+        _, at = max((squares[at], at) for at in (0, 5, 10, 15))
+        row = squares[at // 5 * 4 : at // 5 * 4 + 4]
+        norm = math.copysign(math.hypot(*row), row[0])
+        found.append([one / norm for one in row])
+    return np.array(found).reshape(-1, 4)
