@@ -316,9 +316,10 @@ class OneRobot:
                 sums[k] += white[:, :n].T @ white
         steps, covariances = np.empty((count, n)), np.empty((count, n, n))
         for k in range(count):
-            white = _whiten(sums[k, :, :n], np.eye(n))
+            factor = _factorize(sums[k, :, :n])
+            steps[k], _ = lapack.dpotrs(factor, sums[k, :, n], lower=1)
+            white, _ = lapack.dtrtrs(factor, np.eye(n), lower=1)
             covariances[k] = white.T @ white
-            steps[k] = covariances[k] @ sums[k, :, n]
         return steps, covariances
 
 
@@ -348,12 +349,17 @@ def _drop(rows: Rows, rigid: Array) -> Rows:
     return Rows(*parts, rows.present, 1.0 * rigid)
 
 
-def _whiten(covariance: Array, right: Array) -> Array:
-    """``L^-1 R`` with ``L L^T`` the covariance; see :func:`~tpgmm_torch.gaussians.whiten`."""
-    factor, failed = lapack.dpotrf(covariance, lower=1)
+def _factorize(matrix: Array) -> Array:
+    """Lower Cholesky factor."""
+    factor, failed = lapack.dpotrf(matrix, lower=1)
     if failed:
         raise np.linalg.LinAlgError
-    white, _ = lapack.dtrtrs(factor, right, lower=1)
+    return np.asarray(factor)
+
+
+def _whiten(covariance: Array, right: Array) -> Array:
+    """``L^-1 R`` with ``L L^T`` the covariance; see :func:`~tpgmm_torch.gaussians.whiten`."""
+    white, _ = lapack.dtrtrs(_factorize(covariance), right, lower=1)
     return np.asarray(white)
 
 
