@@ -602,7 +602,7 @@ class Controller:
         return found
 
     def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
-        """The posture that is wanted, and the follower there, where all robots can follow."""
+        """The posture that is wanted, and the follower of the next tick, if it is known."""
         seconds = 0.0 if tick.first else _each(tick.drive)
         posture = self._wanted_posture
         if self._avoidance is not None:
@@ -631,11 +631,12 @@ class Controller:
             return wanted, None
         search = self._search or search
         lower, upper = self._limits
+        following = follower.advance(wanted, tick.drive) if search.active is None else None
+        if following is not None and following.reference is wanted:
+            return wanted, following
         binds = ((found.joints <= lower) | (found.joints >= upper)).any(-1)
-        if search.active is None:
-            fitting = follower.take(wanted, tick.drive)
-            if fitting is not None or not bool(binds.any()):
-                return wanted, fitting
+        if following is not None and not bool(binds.any()):
+            return wanted, following
         joints, self._search = nearest(
             search, follower, wanted, tick.drive, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
