@@ -167,6 +167,11 @@ class Constants:
     """The constants of :func:`linearize_poses` for P operators.
 
     Poses are those of the links, of the ``places`` that the operators refer to, and the base.
+
+    Parameters
+    ----------
+    terms, links, n_objects, **options
+        As for :func:`constants_of`.
     """
 
     def __init__(
@@ -234,6 +239,18 @@ def constants_of(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Constants:
+    """Return the constants of operators, made once.
+
+    Parameters
+    ----------
+    terms : tuple
+        The operators' :attr:`PoseOperator.term`.
+    links : tuple of str
+        Names of the links, objects last.
+    n_objects : int
+        How many of them are objects.
+    dtype, device : torch.dtype, torch.device
+    """
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):
         return Constants(terms, links, n_objects, dtype=dtype, device=device)

@@ -27,7 +27,6 @@ from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Components
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.robots.one_posture import OnePosture
 from tpgmm_torch.robots.robot import Robot
 
 #: What this module does not serve.
@@ -56,7 +55,12 @@ class Links(NamedTuple):
 
     @classmethod
     def of(cls, state: RobotState) -> Links:
-        """Convert the state of one robot."""
+        """Convert the state of one robot.
+
+        Parameters
+        ----------
+        state : RobotState
+        """
         jacobians = state.jacobians.numpy()
         rows = np.zeros((2 * len(state.links) + 1, 3, jacobians.shape[-1]))
         rows[:-1] = jacobians.reshape(-1, *rows.shape[1:])
@@ -65,7 +69,15 @@ class Links(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What an operator says: ``J (q - q_{t-1}) = M mu + c``, see :class:`Linearization`."""
+    """What an operator says of one robot, see :class:`Linearization`.
+
+    Parameters
+    ----------
+    jacobian, matrix, displacement : ndarray of shape (m, n_joints), (m, D) and (m,)
+        ``J (q - q_{t-1}) = M mu + c``.
+    present : ndarray of shape (D,), optional
+    noise : ndarray of shape (m,), optional
+    """
 
     jacobian: Array
     matrix: Array
@@ -75,7 +87,16 @@ class Rows(NamedTuple):
 
 
 class Mixture(NamedTuple):
-    """The arrays of :class:`Components`; ``local`` are those of each conditional."""
+    """The arrays of :class:`Components`.
+
+    Parameters
+    ----------
+    places : ndarray of shape (A, K)
+    log_peak, mean, precision : ndarray of shape (A,)
+        Of the time marginals.
+    local : tuple
+        Of each conditional: means, gains, covariances, and the times of the means (A, 1).
+    """
 
     places: Array
     log_peak: Array
@@ -85,7 +106,12 @@ class Mixture(NamedTuple):
 
     @classmethod
     def of(cls, components: Components) -> Mixture:
-        """Convert what does not need a gradient."""
+        """Convert what needs no gradient.
+
+        Parameters
+        ----------
+        components : Components
+        """
         times = components.marginals
         marginals = times.log_peak.numpy(), times.mean.numpy(), times.precision.numpy()
         local = tuple(
@@ -95,7 +121,13 @@ class Mixture(NamedTuple):
         return cls(components.places.numpy(), *marginals, local)
 
     def weights(self, time: float) -> Array:
-        """Mixing weights (A,) at an instant [s]."""
+        """Compute mixing weights (A,).
+
+        Parameters
+        ----------
+        time : float
+            [s].
+        """
         elapsed = time - self.mean
         log_h = self.log_peak - 0.5 * self.precision * elapsed * elapsed
         shares = np.exp(log_h - log_h.max())
@@ -128,7 +160,14 @@ class Task:
             self._same[start : start + 4, start : start + 4] = 1.0
 
     def linearize(self, joints: Array, links: Links, frames: Frames) -> Rows:
-        """Compute ``J``, ``M``, ``c`` of a posture; see :func:`linearize_poses`."""
+        """Compute ``J``, ``M``, ``c`` of a posture; see :func:`linearize_poses`.
+
+        Parameters
+        ----------
+        joints : ndarray of shape (n_joints,)
+        links : Links
+        frames : mapping of str to Frame
+        """
         if self._columns is not None:
             return Rows(*self._rows, -joints[self._columns])
         at = self._at(links)
@@ -168,7 +207,14 @@ class Task:
         return self._constants[key]
 
     def near(self, rows: Rows, mean: Array) -> Array:
-        """Return ``M`` for means of A components, (A or 1, m, D), on the present's side."""
+        """Return ``M`` (A or 1, m, D), for means on the side of the present quaternions.
+
+        Parameters
+        ----------
+        rows : Rows
+        mean : ndarray of shape (A, D)
+            Of A components.
+        """
         if rows.present is None:
             return rows.matrix[None]
         side = np.where((mean * rows.present) @ self._same < 0, -1.0, 1.0)
@@ -196,8 +242,7 @@ class OneRobot:
     ) -> None:
         self._kinematics, self._posture = kinematics, None
         if isinstance(kinematics, Robot) and type(kinematics).state is Robot.state:
-            size = len(kinematics.links), kinematics.n_joints
-            self._posture = OnePosture(kinematics.tree, *size)
+            self._posture = kinematics.one_posture
         self._tasks = [Task(operator, kinematics) for operator in operators]
         self._free = None if free_precision is None else np.diag(free_precision.numpy())
         self._mixtures: dict[Components, Mixture] = {}
@@ -221,7 +266,7 @@ class OneRobot:
     def __call__(
         self, components: Components, time: Tensor, state: Any, frames: Frames
     ) -> Estimate | None:
-        """Estimate; None if that is not served.
+        """Estimate the joints; None if that is not served.
 
         Parameters
         ----------
@@ -252,7 +297,7 @@ class OneRobot:
         return Estimate(joints, spread, torch.from_numpy(weights @ mixture.places))
 
     def _links(self, state: Any, joints: Array, given: bool) -> Links:
-        """Where the links are."""
+        """Find where the links are."""
         if given or self._posture is None:
             return Links.of(state if given else self._kinematics.state(state))
         return Links(self._kinematics.links, *self._posture(joints))
@@ -260,7 +305,7 @@ class OneRobot:
     def _fuse(
         self, local: Any, time: float, joints: Array, links: Links, frames: Frames
     ) -> tuple[Array, Array]:
-        """Steps (A, n) of components, and their covariances (A, n, n)."""
+        """Compute steps (A, n) of components, and their covariances (A, n, n)."""
         rows = [task.linearize(joints, links, frames) for task in self._tasks]
         means = [mean + gain * (time - start) for mean, gain, _, start in local]
         if self._free is not None:
@@ -274,7 +319,7 @@ class OneRobot:
     def _update(
         self, at: Rows, mean: Array, steps: Array, covariance: Array
     ) -> tuple[Array, Array]:
-        """Update of a prior of the joints, see :mod:`~tpgmm_torch.regression.fusion`."""
+        """Update a prior of the joints, see :mod:`~tpgmm_torch.regression.fusion`."""
         count, width = mean.shape
         size, n = at.jacobian.shape
         rows = np.empty((count, size, width + n))
@@ -297,7 +342,7 @@ class OneRobot:
     def _add(
         self, rows: Sequence[Rows], means: Sequence[Array], local: Any
     ) -> tuple[Array, Array]:
-        """Sum of the operators' information, in terms of the step."""
+        """Add up the operators' information, in terms of the step."""
         assert self._free is not None
         count, n = len(means[0]), len(self._free)
         sums = np.zeros((count, n, n + 1))
@@ -334,7 +379,7 @@ class _Namespace:
 
 
 def _cross(matrix: Array, vector: Array) -> Array:
-    """``m x v``, column by column: shapes (P, 3, n) and (P, 3, 1)."""
+    """Compute ``m x v``, column by column: shapes (P, 3, n) and (P, 3, 1)."""
     after, before = [1, 2, 0], [2, 0, 1]
     return np.asarray(
         matrix[:, after] * vector[:, before] - matrix[:, before] * vector[:, after]
@@ -350,7 +395,7 @@ def _drop(rows: Rows, rigid: Array) -> Rows:
 
 
 def _factorize(matrix: Array) -> Array:
-    """Lower Cholesky factor."""
+    """Compute the lower Cholesky factor."""
     factor, failed = lapack.dpotrf(matrix, lower=1)
     if failed:
         raise np.linalg.LinAlgError
@@ -358,13 +403,13 @@ def _factorize(matrix: Array) -> Array:
 
 
 def _whiten(covariance: Array, right: Array) -> Array:
-    """``L^-1 R`` with ``L L^T`` the covariance; see :func:`~tpgmm_torch.gaussians.whiten`."""
+    """Compute ``L^-1 R``; see :func:`~tpgmm_torch.gaussians.whiten`."""
     white, _ = lapack.dtrtrs(_factorize(covariance), right, lower=1)
     return np.asarray(white)
 
 
 def _match_moments(weights: Array, means: Array, covariances: Array) -> tuple[Array, Array]:
-    """Mean and covariance of a mixture; see :func:`~tpgmm_torch.gaussians.moment_match`."""
+    """Compute moments of a mixture; see :func:`~tpgmm_torch.gaussians.moment_match`."""
     mean = weights @ means
     rest = means - mean
     within = (weights @ covariances.reshape(len(weights), -1)).reshape(covariances.shape[1:])

@@ -157,6 +157,12 @@ def find_columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int6
     """Find the body that moves each column of the Jacobians; tell if columns are joints.
 
     The base moves none. Where joints mimic others, several bodies add up to one joint.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+    n_joints : int
+        Length of the joint vector.
     """
     moving = [at for at, body in enumerate(bodies) if body.joint is not None]
     movers = {bodies[at].joint: at for at in moving}
@@ -168,7 +174,17 @@ def find_columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int6
 def find_movers(
     bodies: Sequence[Body], n_links: int, columns: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Find which columns turn each of L links, and which slide it: 1 or 0, (L, 1, C) both."""
+    """Find which columns turn each of L links, and which slide it: 1 or 0, (L, 1, C) both.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        The links are the last.
+    n_links : int
+        L.
+    columns : ndarray of int, of shape (C,)
+        The body that moves each column.
+    """
     links = range(len(bodies) - n_links, len(bodies))
     mask = np.zeros((n_links, 1, len(columns)), bool)
     for row, at in zip(mask, links, strict=True):
@@ -180,6 +196,12 @@ def find_movers(
 
 def tabulate_motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array]:
     """Tabulate how N matrices of poses, then N of turns, depend on the joints.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        N bodies.
+    n_joints : int
 
     Returns
     -------

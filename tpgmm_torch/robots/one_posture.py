@@ -110,7 +110,7 @@ SQUARES, EYE = _tabulate_squares(), np.eye(4).ravel()
 
 
 def _quaternions(matrices: Array) -> Array:
-    """Unit quaternions (L, 4) of rotation matrices (L, 9)."""
+    """Compute unit quaternions (L, 4) of rotation matrices (L, 9)."""
     found = []
     for squares in (matrices @ SQUARES + EYE).tolist():  # of few numbers Python is faster
         _, at = max((squares[at], at) for at in (0, 5, 10, 15))
