@@ -151,23 +151,33 @@ class Regression:
         """
         if candidates:
             state = self._state(state)
-        elif time.ndim == 0 and self._one_robot is not None:
-            one = self._one_robot(self._components_at(time), time, state, frames)
-            if one is not None:
-                return keep_within(one, bounds)
-        joints = state.joints if isinstance(state, RobotState) else state
-        poses = {name: frames[name] for name in self.frame_names if name in frames}
-        shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
-        batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
-        if batch.numel() <= PART or time.is_cuda:
-            found = self._estimate_together(time, state, frames)
-        else:
-            found = self._in_parts(batch, time, state, poses)
+        found = None if candidates else self._estimate_one(time, state, frames)
+        if found is None:
+            found = self._estimate_many(time, state, frames)
         found = keep_within(found, bounds)
         if candidates:
             own = self.candidates(time, self._state(state), frames, found)
             found = replace(found, candidates=own)
         return found
+
+    def _estimate_one(
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
+    ) -> Estimate | None:
+        """Estimate a single robot in numpy; None where that does not serve."""
+        if time.ndim or (one := self._one_robot) is None:
+            return None
+        return one(self._components_at(time), time, state, frames)
+
+    def _estimate_many(
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
+    ) -> Estimate:
+        joints = state.joints if isinstance(state, RobotState) else state
+        poses = {name: frames[name] for name in self.frame_names if name in frames}
+        shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
+        batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
+        if batch.numel() <= PART or time.is_cuda:
+            return self._estimate_together(time, state, frames)
+        return self._in_parts(batch, time, state, poses)
 
     def fuse(
         self, components: Components, time: Tensor, state: RobotState, frames: Frames

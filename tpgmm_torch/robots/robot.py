@@ -8,6 +8,7 @@ import os
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
@@ -319,11 +320,9 @@ class Robot(Described):
             self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
                 **options
             )
-            sizes = len(self.links), self.n_joints
-            self.forward_kinematics = TreeKinematics(self.tree, *sizes, **options)
-        plain = self.lower.is_cpu and self.lower.dtype == torch.float64
-        #: The same of a single posture in numpy, for robots in float64 on a processor.
-        self.one_posture = OnePosture(self.tree, *sizes) if plain else None
+            self.forward_kinematics = TreeKinematics(
+                self.tree, len(self.links), self.n_joints, **options
+            )
 
     def _warn_of_doubts(self) -> Self:
         """Warn once of all that was passed over and concerns the joints; returns the robot."""
@@ -365,6 +364,13 @@ class Robot(Described):
         return RobotState(
             joints, self.links, positions, orientations, jacobians, (), self.joint_names
         )
+
+    @cached_property
+    def one_posture(self) -> OnePosture | None:
+        """The kinematics of a single posture in numpy; None but in float64 on a processor."""
+        if self.lower.dtype != torch.float64 or not self.lower.is_cpu:
+            return None
+        return OnePosture(self.tree, len(self.links), self.n_joints)
 
     def _state_of_one(self, joints: Tensor) -> RobotState | None:
         """Compute the state of a single posture in numpy; None where that does not serve."""

@@ -630,13 +630,11 @@ class Controller:
         if follower is None or search is None or self._limits is None:
             return wanted, None
         search = self._search or search
-        lower, upper = self._limits
-        following = follower.advance(wanted, tick.drive) if search.active is None else None
-        if following is not None and following.reference is wanted:
-            return wanted, following
-        binds = ((found.joints <= lower) | (found.joints >= upper)).any(-1)
-        if following is not None and not bool(binds.any()):
-            return wanted, following
+        if search.active is None:
+            following = follower.advance(wanted, tick.drive)
+            if following.reference is wanted or not _touch_limits(found, self._limits).any():
+                return wanted, following
+        binds = _touch_limits(found, self._limits)
         joints, self._search = nearest(
             search, follower, wanted, tick.drive, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
@@ -800,6 +798,11 @@ def _novelty(
     known = {n: f for n, f in first.items() if n in summary.frames and summary.frames[n].moves}
     novelty = torch.as_tensor(summary.novelty(start, {**now, **known})).to(start)
     return novelty.expand(start.shape[:-1])
+
+
+def _touch_limits(found: Estimate, limits: tuple[Tensor, Tensor]) -> Tensor:
+    """Robots (...) of which a joint is estimated at a limit of position."""
+    return ((found.joints <= limits[0]) | (found.joints >= limits[1])).any(-1)
 
 
 def _each(seconds: Seconds) -> float | Tensor:
