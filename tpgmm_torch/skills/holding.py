@@ -209,8 +209,8 @@ class Holding:
         if unknown := given.keys() - self.frames.keys() - seen.keys():
             raise UnknownNameError("frame", unknown.pop(), "the situation", self.frames)
         names = {hold.frame: None for hold in self.holds} | dict.fromkeys((*self.held, *given))
-        if not names and not seen:
-            return self
+        if not names:
+            return replace(self, frames={**self.frames, **seen}) if seen else self
         places, held = {**self.frames, **seen}, dict(self.held)
         state_now = cache(lambda: self.kinematics.state(joints))
         for name in filter(places.__contains__, names):

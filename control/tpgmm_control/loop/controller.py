@@ -416,14 +416,15 @@ class Controller:
         if not self._trusts:
             return _Tick(seconds, late, False, seconds)
         paused = None
-        if np.max(seconds) > PAUSE:
+        each: Any = seconds if isinstance(seconds, float) else seconds.reshape(-1)
+        if np.any(each > PAUSE):
             warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
-            paused = np.broadcast_to(np.ravel(seconds) > PAUSE, len(self._progress.time))
-        seconds = np.minimum(seconds, LONGEST_TICK)
+            paused = np.broadcast_to(each > PAUSE, len(self._progress.time))
+        seconds, each = (np.minimum(x, LONGEST_TICK) for x in (seconds, each))
         usual = self._progress.usual_dt
-        most = CATCH_UP * np.where(usual > 0, usual, np.ravel(seconds))
+        most = CATCH_UP * np.where(usual > 0, usual, each)
         drive: Seconds = seconds
-        if (np.ravel(seconds) > most).any():
+        if (each > most).any():
             drive = np.minimum(seconds, most.reshape(self.reference.shape[:-1]))
         return _Tick(seconds, late, False, drive, paused)
 
@@ -499,7 +500,8 @@ class Controller:
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
-        over &= self._fade.done.numpy(force=True).reshape(-1)
+        if over.any():
+            over &= self._fade.done.numpy(force=True).reshape(-1)
         tick.ended = self._tensor(over) if over.any() else None
 
     def _obstruction(self, passed: Array) -> Array | None:
@@ -739,6 +741,8 @@ class Controller:
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
         if not measured or tick.joints is None:
+            if self._gaps is None and self._avoidance is None:
+                return self._following.reference
             return self._following.reference - (self.reference - self._wanted_posture)
         return torch.where(tick.joints.isnan(), self._wanted_posture, tick.joints)
 

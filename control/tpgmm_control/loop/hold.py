@@ -139,7 +139,7 @@ class HoldWatch:
                 rest = replace(rest, joints=stood)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
-        return replace(self, rests=rests), holding, places
+        return replace_fields(self, rests=rests), holding, places
 
     def _ungiven(self, holding: Holding, free_yet: Mapping[str, Tensor]) -> Holding:
         """The skill's holds count again for robots for which they have begun."""
@@ -310,7 +310,7 @@ class Holds:
             frames = _seen_frames(frames, holding, lost)
         shares = inputs.shares if inputs is not None and holding.held else {}
         holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
-        new = replace(self, holding=holding, watch=watch, given=given)
+        new = replace_fields(self, holding=holding, watch=watch, given=given)
         if not (lost or self.hidden):
             return new
         assert inputs is not None

@@ -276,19 +276,23 @@ class Moment(NamedTuple):
     def generated(self, exact: Self, asked: Mask, bounds: MotionBounds) -> Self:
         """That step, with the joints that are asked on the fastest way to it."""
         limits, joint = limit_arrays(bounds), np.nonzero(asked)[-1]
-        rates = np.stack((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
+        rates = np.array((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
         target, before = (
-            np.clip(np.rint(x[asked] * GRID) / GRID, limits.lower[joint], limits.upper[joint])
+            np.minimum(
+                np.maximum(np.rint(x[asked] * GRID) / GRID, limits.lower[joint]),
+                limits.upper[joint],
+            )
             for x in (exact.wanted, self.wanted)
         )
-        dt = np.broadcast_to(exact.dt, asked.shape)[asked]
+        dt = (np.zeros(asked.shape) + exact.dt)[asked]
         drift, moved = self.drift[asked], (target - before) / dt
         # a motion is expected to go on only after a while, and to stop at once: a posture that
         # has jumped is not expected further on
         slower = np.where(drift * moved < 0, 0.0, moved)
         rising = drift + np.minimum(1.0, dt / MEMORY) * (moved - drift)
         drift = np.where(np.abs(slower) < np.abs(rising), slower, rising)
-        drift = np.clip(drift, -CRUISE * rates[0], CRUISE * rates[0])
+        fastest = CRUISE * rates[0]
+        drift = np.minimum(np.maximum(drift, -fastest), fastest)
         start = self.motion[:, asked]
         part = first_part(start, target, drift, dt, rates)
         unsafe = ~self._stops(part, asked, bounds)
