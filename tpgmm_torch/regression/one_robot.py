@@ -158,6 +158,7 @@ class Task:
         self._same = np.zeros((size, size))
         for start in starts:
             self._same[start : start + 4, start : start + 4] = 1.0
+        self._others = 1.0 - self._same.diagonal()
 
     def linearize(self, joints: Array, links: Links, frames: Frames) -> Rows:
         """Compute ``J``, ``M``, ``c`` of a posture; see :func:`linearize_poses`.
@@ -217,7 +218,7 @@ class Task:
         """
         if rows.present is None:
             return rows.matrix[None]
-        side = np.where((mean * rows.present) @ self._same < 0, -1.0, 1.0)
+        side = np.copysign(1.0, (mean * rows.present) @ self._same + self._others)
         return rows.matrix * side[:, None, :]
 
 
@@ -291,7 +292,7 @@ class OneRobot:
             step, covariance = _match_moments(weights, steps, covariances)
         except NOT_SERVED:
             return None
-        if not math.isfinite(step.sum() + covariance.sum()):
+        if not math.isfinite(step @ step):
             return None
         joints, spread = torch.from_numpy(numbers + step), torch.from_numpy(covariance)
         return Estimate(joints, spread, torch.from_numpy(weights @ mixture.places))
@@ -331,13 +332,9 @@ class OneRobot:
             square = square + np.diag(at.noise)
         both = np.concatenate((mean, steps), 1)[:, :, None]
         right = np.concatenate((cross[:, :, width:], rows @ both + at.displacement[:, None]), 2)
-        found, rest = np.empty_like(steps), np.empty((count, n, n))
-        for k in range(count):
-            white = _whiten(square[k], right[k])
-            update = white[:, :n].T @ white
-            found[k] = steps[k] - update[:, n]
-            rest[k] = covariance[k, width:, width:] - update[:, :n]
-        return found, rest
+        white = np.array([_whiten(*pair) for pair in zip(square, right, strict=True)])
+        update = white[:, :, :n].swapaxes(1, 2) @ white
+        return steps - update[:, :, n], covariance[:, width:, width:] - update[:, :, :n]
 
     def _add(
         self, rows: Sequence[Rows], means: Sequence[Array], local: Any
