@@ -544,11 +544,14 @@ def between(one: Frame, other: Frame, share: float | Tensor) -> Frame:
     position, turn = one.position, one.orientation
     alone = isinstance(share, float) or not share.ndim
     if alone and one.is_single and other.is_single:  # of few numbers numpy is faster
-        start, end = (np.concatenate((f.position, f.orientation)) for f in (one, other))
+        start, end = (
+            np.array([*each.position.tolist(), *each.orientation.tolist()])
+            for each in (one, other)
+        )
         end[3:] *= math.copysign(1.0, start[3:] @ end[3:])
         pose = start + float(share) * (end - start)
         pose[3:] /= math.sqrt(pose[3:] @ pose[3:])
-        whole = torch.from_numpy(pose)
+        whole = torch.from_numpy(pose).to(position)
         return Frame.from_checked(whole[:3], whole[3:])
     share = torch.as_tensor(share, dtype=position.dtype, device=position.device).unsqueeze(-1)
     inner = (other.orientation * turn).sum(-1, keepdim=True)
