@@ -27,7 +27,6 @@ from tpgmm_torch.operators.stack import POSE_OPERATORS
 from tpgmm_torch.regression.conditionals import Components
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.robots.robot import Robot
 
 #: What this module does not serve.
 NOT_SERVED = RuntimeError, KeyError, np.linalg.LinAlgError
@@ -241,9 +240,8 @@ class OneRobot:
         operators: Sequence[Operator],
         free_precision: Tensor | None = None,
     ) -> None:
-        self._kinematics, self._posture = kinematics, None
-        if isinstance(kinematics, Robot) and type(kinematics).state is Robot.state:
-            self._posture = kinematics.one_posture
+        self._kinematics = kinematics
+        self._posture = getattr(kinematics, "one_posture", None)
         self._tasks = [Task(operator, kinematics) for operator in operators]
         self._free = None if free_precision is None else np.diag(free_precision.numpy())
         self._mixtures: dict[Components, Mixture] = {}

@@ -367,8 +367,9 @@ class Robot(Described):
 
     @cached_property
     def one_posture(self) -> OnePosture | None:
-        """The kinematics of a single posture in numpy; None but in float64 on a processor."""
-        if self.lower.dtype != torch.float64 or not self.lower.is_cpu:
+        """Kinematics of a single posture in numpy; None but in float64 on a processor."""
+        plain = self.lower.dtype == torch.float64 and self.lower.is_cpu
+        if not plain or type(self).state is not Robot.state:
             return None
         return OnePosture(self.tree, len(self.links), self.n_joints)
 
