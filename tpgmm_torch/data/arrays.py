@@ -64,4 +64,5 @@ def _check_finite(tensor: Tensor, name: str) -> None:
 
 def as_array(tensor: Tensor) -> Array:
     """Convert a ``tensor``, without its gradient, to an array of float64."""
-    return np.asarray(tensor.detach().cpu().double().numpy())
+    array = tensor.numpy(force=True)
+    return array if array.dtype == np.float64 else array.astype(np.float64)

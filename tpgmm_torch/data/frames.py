@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -89,6 +90,13 @@ class Frame:
     def batch_shape(self) -> torch.Size:
         """Leading dimensions: () for one pose, (T,) for a pose per time step."""
         return self.position.shape[:-1]
+
+    @property
+    def is_single(self) -> bool:
+        """True for one pose on the processor of which nothing is differentiated."""
+        position, turn = self.position, self.orientation
+        plain = position.is_cpu and not (position.requires_grad or turn.requires_grad)
+        return plain and position.ndim == 1 and turn.ndim == 1
 
     def to(self, *args: Any, **kwargs: Any) -> Frame:
         """Copy to another device or dtype, like :meth:`torch.Tensor.to`."""
@@ -188,6 +196,12 @@ class Frame:
         distance, angle : float
             The units [m], [rad]; the larger of both changes counts.
         """
+        if self.is_single and other.is_single:  # of few numbers Python is faster
+            there, turn = self.position.tolist(), self.orientation.tolist()
+            cosine = abs(math.sumprod(turn, other.orientation.tolist()))
+            moved = math.dist(there, other.position.tolist()) / distance
+            most = max(moved, 2 * math.acos(min(cosine, 1.0)) / angle)
+            return torch.tensor(most, dtype=self.position.dtype)
         moved = torch.linalg.vector_norm(other.position - self.position, dim=-1)
         inner = (self.orientation * other.orientation).sum(-1).abs().clamp(max=1)
         return torch.maximum(moved / distance, 2 * torch.acos(inner) / angle)

@@ -132,7 +132,7 @@ def linearize_poses(
     frames : mapping of str to Frame
     """
     terms, like = tuple(operator.term for operator in operators), state.joints
-    at = _constants(terms, state.links, len(state.carriers), like.dtype, like.device)
+    at = constants_of(terms, state.links, len(state.carriers), like.dtype, like.device)
     places = [*(_place(name, state, frames) for name in at.places), *at.base]
     batch = common_shape(state.positions.shape[:-2], *(place.batch_shape for place in places))
     positions, orientations = _all_poses(state, places, batch)
@@ -163,10 +163,15 @@ def linearize_poses(
     return result.without(torch.stack(flags, -1).repeat_interleave(3, -1))
 
 
-class _Constants:
+class Constants:
     """The constants of :func:`linearize_poses` for P operators.
 
     Poses are those of the links, of the ``places`` that the operators refer to, and the base.
+
+    Parameters
+    ----------
+    terms, links, n_objects, **options
+        As for :func:`constants_of`.
     """
 
     def __init__(
@@ -227,16 +232,28 @@ def _bilinear(terms: Sequence[_Term], **options: Any) -> tuple[Tensor, tuple[int
 
 
 @lru_cache(maxsize=64)
-def _constants(
+def constants_of(
     terms: tuple[_Term, ...],
     links: tuple[str, ...],
     n_objects: int,
     dtype: torch.dtype,
     device: torch.device,
-) -> _Constants:
+) -> Constants:
+    """Return the constants of operators, made once.
+
+    Parameters
+    ----------
+    terms : tuple
+        The operators' :attr:`PoseOperator.term`.
+    links : tuple of str
+        Names of the links, objects last.
+    n_objects : int
+        How many of them are objects.
+    dtype, device : torch.dtype, torch.device
+    """
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):
-        return _Constants(terms, links, n_objects, dtype=dtype, device=device)
+        return Constants(terms, links, n_objects, dtype=dtype, device=device)
 
 
 def _all_poses(

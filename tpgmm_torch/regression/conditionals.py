@@ -182,6 +182,36 @@ class Conditionals(_OfComponents):
         return gaussians.log_density(residuals, covariance, name, degrees).mT
 
 
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Some components of the mixture: those that count.
+
+    Parameters
+    ----------
+    index : Tensor of shape (A,)
+        Which ones they are.
+    places : Tensor of shape (A, K)
+        The same as rows of the identity.
+    marginals : TimeMarginals
+        Their weights and time marginals.
+    conditionals : tuple of Conditionals
+        Of each operator; or of all operators' coordinates at once, where the fusion is a
+        Kalman update.
+    """
+
+    index: Tensor
+    places: Tensor
+    marginals: TimeMarginals
+    conditionals: tuple[Conditionals, ...]
+
+    def select(self, index: Sequence[int]) -> Components:
+        """Some of them, by their place among them."""
+        places = torch.tensor(index, device=self.index.device)
+        conditionals = tuple(one.select(places) for one in self.conditionals)
+        marginals = self.marginals.select(places)
+        return Components(self.index[places], self.places[places], marginals, conditionals)
+
+
 class ActiveComponents:
     """The components whose weight counts, for windows of time; beyond these all of them.
 

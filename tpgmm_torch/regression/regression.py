@@ -31,6 +31,7 @@ from tpgmm_torch.operators.base import carried_objects, frame_names, leaves, of_
 from tpgmm_torch.operators.wrench import ExpectedForce, Wrench
 from tpgmm_torch.regression.conditionals import (
     ActiveComponents,
+    Components,
     Conditionals,
     TimeMarginals,
     predictive_scale,
@@ -39,6 +40,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.joint_limits import keep_within
+from tpgmm_torch.regression.one_robot import OneRobot
 from tpgmm_torch.regression.posture import PostureSearch, Residual
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
@@ -53,36 +55,6 @@ PART = 256
 
 #: The covariance of an operator, as a share of what it would be one priority below.
 STRICT = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Components:
-    """Some components of the mixture: those that count.
-
-    Parameters
-    ----------
-    index : Tensor of shape (A,)
-        Which ones they are.
-    places : Tensor of shape (A, K)
-        The same as rows of the identity.
-    marginals : TimeMarginals
-        Their weights and time marginals.
-    conditionals : tuple of Conditionals
-        Of each operator; or of all operators' coordinates at once, where the fusion is a
-        Kalman update.
-    """
-
-    index: Tensor
-    places: Tensor
-    marginals: TimeMarginals
-    conditionals: tuple[Conditionals, ...]
-
-    def select(self, index: Sequence[int]) -> Components:
-        """Some of them, by their place among them."""
-        places = torch.tensor(index, device=self.index.device)
-        conditionals = tuple(one.select(places) for one in self.conditionals)
-        marginals = self.marginals.select(places)
-        return Components(self.index[places], self.places[places], marginals, conditionals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,19 +151,33 @@ class Regression:
         """
         if candidates:
             state = self._state(state)
-        joints = state.joints if isinstance(state, RobotState) else state
-        poses = {name: frames[name] for name in self.frame_names if name in frames}
-        shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
-        batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
-        if batch.numel() <= PART or time.is_cuda:
-            found = self._estimate_together(time, state, frames)
-        else:
-            found = self._in_parts(batch, time, state, poses)
+        found = None if candidates else self._estimate_one(time, state, frames)
+        if found is None:
+            found = self._estimate_many(time, state, frames)
         found = keep_within(found, bounds)
         if candidates:
             own = self.candidates(time, self._state(state), frames, found)
             found = replace(found, candidates=own)
         return found
+
+    def _estimate_one(
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
+    ) -> Estimate | None:
+        """Estimate a single robot in numpy; None where that does not serve."""
+        if time.ndim or (one := self._one_robot) is None:
+            return None
+        return one(self._components_at(time), time, state, frames)
+
+    def _estimate_many(
+        self, time: Tensor, state: Tensor | RobotState, frames: Frames
+    ) -> Estimate:
+        joints = state.joints if isinstance(state, RobotState) else state
+        poses = {name: frames[name] for name in self.frame_names if name in frames}
+        shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
+        batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
+        if batch.numel() <= PART or time.is_cuda:
+            return self._estimate_together(time, state, frames)
+        return self._in_parts(batch, time, state, poses)
 
     def fuse(
         self, components: Components, time: Tensor, state: RobotState, frames: Frames
@@ -440,6 +426,20 @@ class Regression:
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
             return KalmanUpdate(self.kinematics, operators, self.scaled_conditionals)
+
+    @cached_property
+    def _one_robot(self) -> OneRobot | None:
+        """Estimates of a single robot, where they are of a kind that is served."""
+        operators = self._of_joints[0]
+        learning = self.log_weights.requires_grad or self.conditionals[0].mean.requires_grad
+        served = isinstance(self.fusion, InformationFusion) and not learning
+        if not served or not OneRobot.serves(operators, self.kinematics):
+            return None
+        with torch.inference_mode(False):
+            if self._update is None:
+                return OneRobot(self.kinematics, operators, self.free_precision)
+            task = self._update.task
+            return OneRobot(self.kinematics, () if task is None else (task,))
 
     @cached_property
     def free_precision(self) -> Tensor:

@@ -51,7 +51,7 @@ class TreeKinematics:
         device: torch.device | str,
     ) -> None:
         self._options: dict[str, Any] = {"dtype": dtype, "device": device}
-        factors, follow, shift = _motions(bodies, n_joints)
+        factors, follow, shift = tabulate_motions(bodies, n_joints)
         self._factors = self._constant(factors.reshape(4, -1, 16)).unbind(0)
         self._follow, self._shift = self._constant(follow), self._constant(shift)
         parents = [body.parent for body in bodies]
@@ -67,7 +67,7 @@ class TreeKinematics:
         ]
         self._order = self._index(np.argsort(np.concatenate(levels)).tolist())
 
-        columns, are_joints = _columns(bodies, n_joints)
+        columns, are_joints = find_columns(bodies, n_joints)
         self._mimic = None if are_joints else self._constant(follow[:, columns].T)  # (C, n)
         self._select_entries(bodies, n_links, columns)
 
@@ -85,13 +85,9 @@ class TreeKinematics:
         wanted = entries[links][:, :3, 3], origins, axes, entries[len(bodies) + links][:, 0]
         self._wanted = self._index(np.concatenate([part.ravel() for part in wanted]).tolist())
         self._sizes = [part.size for part in wanted]
-        mask = np.zeros((n_links, 1, len(columns)), bool)
-        for row, at in zip(mask, links.tolist(), strict=True):
-            while at := bodies[at].parent:
-                row |= columns == at
-        slide = np.array([bodies[at].slides for at in columns], bool)
-        self._turns = self._constant(1.0 * (mask & ~slide))  # (L, 1, C)
-        self._slides = self._constant(1.0 * (mask & slide)) if slide.any() else None
+        turns, slides = find_movers(bodies, n_links, columns)
+        self._turns = self._constant(turns)
+        self._slides = self._constant(slides) if slides.any() else None
 
     def _constant(self, values: Array) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(**self._options)
@@ -157,10 +153,16 @@ def _product(first: Tensor, second: Tensor) -> Tensor:
     return first @ second
 
 
-def _columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], bool]:
+def find_columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], bool]:
     """Find the body that moves each column of the Jacobians; tell if columns are joints.
 
     The base moves none. Where joints mimic others, several bodies add up to one joint.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+    n_joints : int
+        Length of the joint vector.
     """
     moving = [at for at, body in enumerate(bodies) if body.joint is not None]
     movers = {bodies[at].joint: at for at in moving}
@@ -169,8 +171,37 @@ def _columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], 
     return np.array(columns, np.int64), are_joints
 
 
-def _motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array]:
+def find_movers(
+    bodies: Sequence[Body], n_links: int, columns: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Find which columns turn each of L links, and which slide it: 1 or 0, (L, 1, C) both.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        The links are the last.
+    n_links : int
+        L.
+    columns : ndarray of int, of shape (C,)
+        The body that moves each column.
+    """
+    links = range(len(bodies) - n_links, len(bodies))
+    mask = np.zeros((n_links, 1, len(columns)), bool)
+    for row, at in zip(mask, links, strict=True):
+        while at := bodies[at].parent:
+            row |= columns == at
+    slide = np.array([bodies[at].slides for at in columns], bool)
+    return (mask & ~slide).astype(float), (mask & slide).astype(float)
+
+
+def tabulate_motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array]:
     """Tabulate how N matrices of poses, then N of turns, depend on the joints.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        N bodies.
+    n_joints : int
 
     Returns
     -------

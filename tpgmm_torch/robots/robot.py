@@ -8,6 +8,7 @@ import os
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
@@ -26,6 +27,7 @@ from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Described, RobotState, parse_dtype
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
+from tpgmm_torch.robots.one_posture import OnePosture
 from tpgmm_torch.robots.urdf import (
     LIMITS,
     X_AXIS,
@@ -349,6 +351,8 @@ class Robot(Described):
             If there are more or fewer joints than ``joint_names``, or a value is not finite.
         """
         joints = self.joint_tensor(joints)
+        if (one := self._state_of_one(joints)) is not None:
+            return one
         batch = joints.shape[:-1]
         rows = joints.reshape(batch.numel(), self.n_joints)
         parts: Iterable[Tensor] = self.forward_kinematics(rows)
@@ -360,6 +364,27 @@ class Robot(Described):
         return RobotState(
             joints, self.links, positions, orientations, jacobians, (), self.joint_names
         )
+
+    @cached_property
+    def one_posture(self) -> OnePosture | None:
+        """Kinematics of a single posture in numpy; None but in float64 on a processor."""
+        plain = self.lower.dtype == torch.float64 and self.lower.is_cpu
+        if not plain or type(self).state is not Robot.state:
+            return None
+        return OnePosture(self.tree, len(self.links), self.n_joints)
+
+    def _state_of_one(self, joints: Tensor) -> RobotState | None:
+        """Compute the state of a single posture in numpy; None where that does not serve."""
+        if joints.ndim > 1 or self.one_posture is None or torch.compiler.is_compiling():
+            return None
+        try:
+            numbers = joints.numpy()
+        except RuntimeError:  # a tensor of which something is differentiated has no numbers
+            return None
+        positions, turns, rows = map(torch.from_numpy, self.one_posture(numbers))
+        jacobians = rows[:-1].view(len(self.links), 6, self.n_joints)
+        parts = positions, turns, jacobians, (), self.joint_names
+        return RobotState(joints, self.links, *parts)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None

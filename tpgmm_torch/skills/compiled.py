@@ -27,10 +27,10 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.frames import Frame, Frames
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
+from tpgmm_torch.regression.conditionals import Components, Conditionals, TimeMarginals
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.joint_limits import keep_within
-from tpgmm_torch.regression.regression import Components, Regression
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Bounds, RobotState
 from tpgmm_torch.robots.robot import Robot
 

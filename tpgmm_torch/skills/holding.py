@@ -9,6 +9,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -208,8 +209,8 @@ class Holding:
         if unknown := given.keys() - self.frames.keys() - seen.keys():
             raise UnknownNameError("frame", unknown.pop(), "the situation", self.frames)
         names = {hold.frame: None for hold in self.holds} | dict.fromkeys((*self.held, *given))
-        if not names and not seen:
-            return self
+        if not names:
+            return replace(self, frames={**self.frames, **seen}) if seen else self
         places, held = {**self.frames, **seen}, dict(self.held)
         state_now = cache(lambda: self.kinematics.state(joints))
         for name in filter(places.__contains__, names):
@@ -531,19 +532,31 @@ def choose(where: Tensor, one: Frame, other: Frame | None) -> Frame:
     return Frame.from_checked(position, torch.where(mask, one.orientation, other.orientation))
 
 
-def between(one: Frame, other: Frame, share: Tensor) -> Frame:
+def between(one: Frame, other: Frame, share: float | Tensor) -> Frame:
     """Return a pose between two others.
 
     Parameters
     ----------
     one, other : Frame
-    share : Tensor of shape (...)
+    share : float or Tensor of shape (...)
         Of the way, from 0 to 1.
     """
-    share = share.unsqueeze(-1)
-    inner = (other.orientation * one.orientation).sum(-1, keepdim=True)
-    turn = quaternions.hemisphere_sign(inner) * other.orientation
+    position, turn = one.position, one.orientation
+    alone = isinstance(share, float) or not share.ndim
+    if alone and one.is_single and other.is_single:  # of few numbers numpy is faster
+        start, end = (
+            np.array([*each.position.tolist(), *each.orientation.tolist()])
+            for each in (one, other)
+        )
+        end[3:] *= math.copysign(1.0, start[3:] @ end[3:])
+        pose = start + float(share) * (end - start)
+        pose[3:] /= math.sqrt(pose[3:] @ pose[3:])
+        whole = torch.from_numpy(pose).to(position)
+        return Frame.from_checked(whole[:3], whole[3:])
+    share = torch.as_tensor(share, dtype=position.dtype, device=position.device).unsqueeze(-1)
+    inner = (other.orientation * turn).sum(-1, keepdim=True)
+    near = quaternions.hemisphere_sign(inner) * other.orientation
     return Frame.from_checked(
-        one.position + share * (other.position - one.position),
-        quaternions.normalize(one.orientation + share * (turn - one.orientation)),
+        position + share * (other.position - position),
+        quaternions.normalize(turn + share * (near - turn)),
     )

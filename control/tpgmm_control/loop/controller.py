@@ -436,14 +436,15 @@ class Controller:
         if not self._trusts:
             return _Tick(seconds, late, False, seconds)
         paused = None
-        if np.max(seconds) > PAUSE:
+        each: Any = seconds if isinstance(seconds, float) else seconds.reshape(-1)
+        if np.any(each > PAUSE):
             warnings.warn(LONG_TICK, PlausibilityWarning, stacklevel=3)
-            paused = np.broadcast_to(np.ravel(seconds) > PAUSE, len(self._progress))
-        seconds = np.minimum(seconds, LONGEST_TICK)
+            paused = np.broadcast_to(each > PAUSE, len(self._progress))
+        seconds, each = (np.minimum(x, LONGEST_TICK) for x in (seconds, each))
         usual = np.array([robot.timing.usual_dt for robot in self._progress])
-        most = CATCH_UP * np.where(usual > 0, usual, np.ravel(seconds))
+        most = CATCH_UP * np.where(usual > 0, usual, each)
         drive: Seconds = seconds
-        if (np.ravel(seconds) > most).any():
+        if (each > most).any():
             drive = np.minimum(seconds, most.reshape(self.reference.shape[:-1]))
         return _Tick(seconds, late, False, drive, paused)
 
@@ -515,7 +516,8 @@ class Controller:
         else:
             self._advance_progress(tick, passed, still, obstructed)
         over = (self._times >= self._end) & (before >= self._end)
-        over &= self._fade.done.numpy(force=True).reshape(-1)
+        if over.any():
+            over &= self._fade.done.numpy(force=True).reshape(-1)
         tick.ended = self._tensor(over) if over.any() else None
 
     def _advance_progress(
@@ -665,7 +667,7 @@ class Controller:
         return found
 
     def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
-        """The posture that is wanted, and the follower there, where all robots can follow."""
+        """The posture that is wanted, and the follower of the next tick, if it is known."""
         seconds = 0.0 if tick.first else _each(tick.drive)
         posture = self._wanted_posture
         if self._avoidance is not None:
@@ -693,12 +695,11 @@ class Controller:
         if follower is None or search is None or self._limits is None:
             return wanted, None
         search = self._search or search
-        lower, upper = self._limits
-        binds = ((found.joints <= lower) | (found.joints >= upper)).any(-1)
         if search.active is None:
-            fitting = follower.take(wanted, tick.drive)
-            if fitting is not None or not bool(binds.any()):
-                return wanted, fitting
+            following = follower.advance(wanted, tick.drive)
+            if following.reference is wanted or not _touch_limits(found, self._limits).any():
+                return wanted, following
+        binds = _touch_limits(found, self._limits)
         joints, self._search = nearest(
             search, follower, wanted, tick.drive, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
@@ -819,6 +820,8 @@ class Controller:
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
         if not measured or tick.joints is None:
+            if self._gaps is None and self._avoidance is None:
+                return self._following.reference
             return self._following.reference - (self.reference - self._wanted_posture)
         return torch.where(tick.joints.isnan(), self._wanted_posture, tick.joints)
 
@@ -880,6 +883,11 @@ def _novelty(
     known = {n: f for n, f in first.items() if n in summary.frames and summary.frames[n].moves}
     novelty = torch.as_tensor(summary.novelty(start, {**now, **known})).to(start)
     return novelty.expand(start.shape[:-1])
+
+
+def _touch_limits(found: Estimate, limits: tuple[Tensor, Tensor]) -> Tensor:
+    """Robots (...) of which a joint is estimated at a limit of position."""
+    return ((found.joints <= limits[0]) | (found.joints >= limits[1])).any(-1)
 
 
 def _each(seconds: Seconds) -> float | Tensor:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_control.sensing.inputs import Inputs
+from tpgmm_control.sensing.states import replace_fields
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.skills.holding import (
@@ -138,7 +139,7 @@ class HoldWatch:
                 rest = replace(rest, joints=stood)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
-        return replace(self, rests=rests), holding, places
+        return replace_fields(self, rests=rests), holding, places
 
     def _ungiven(self, holding: Holding, free_yet: Mapping[str, Tensor]) -> Holding:
         """The skill's holds count again for robots for which they have begun."""
@@ -159,7 +160,7 @@ class HoldWatch:
         yet: Tensor,
     ) -> tuple[Rest, Holding]:
         """After a new reading of an object."""
-        rest = replace(rest, seen=seen, since=rest.since + dt)
+        rest = replace_fields(rest, seen=seen, since=rest.since + dt)
         rest, holding = self._taken(name, rest, joints, holding, dt, yet)
         if rest.found and bool((due := rest.since >= LOST_PERIOD).any()):
             rest, holding = self._lost(name, rest, joints, holding, due, yet)
@@ -177,11 +178,13 @@ class HoldWatch:
         """After a link may have taken an object along, or somebody else moved it."""
         moved = rest.pose.change(rest.seen, MOVED, TURNED)
         free = holding.free(name, moved) & yet
-        settled = (torch.as_tensor(dt).to(moved) / SETTLING).clamp(max=1.0)
+        settled: float | Tensor = min(dt / SETTLING, 1.0) if isinstance(dt, float) else 0.0
+        if isinstance(dt, Tensor):
+            settled = (dt.to(moved) / SETTLING).clamp(max=1.0)
         rests = free & (moved < 0.1)
         if bool(rests.all()):
             pose = between(rest.pose, rest.seen, settled)
-            return replace(rest, pose=pose, joints=joints), holding
+            return replace_fields(rest, pose=pose, joints=joints), holding
         settles, elsewhere, found = rests, torch.zeros_like(rests), rest.found
         if bool((asked := free & ~rests).any()):
             before, now = self.kinematics.state(rest.joints), self.kinematics.state(joints)
@@ -307,7 +310,7 @@ class Holds:
             frames = _seen_frames(frames, holding, lost)
         shares = inputs.shares if inputs is not None and holding.held else {}
         holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
-        new = replace(self, holding=holding, watch=watch, given=given)
+        new = replace_fields(self, holding=holding, watch=watch, given=given)
         if not (lost or self.hidden):
             return new
         assert inputs is not None

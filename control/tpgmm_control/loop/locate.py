@@ -401,7 +401,7 @@ class Progress:
             self.followed = Comparison(self.servo.expected, self.servo.readings.median)
 
     def _count_slow(self, slow: Flags, dt: float) -> float:
-        """Count gaps for which time slows: once they outlast any lag, the robot is waited for."""
+        """Count gaps for which time slows: those that outlast any lag are waited for."""
         if not slow.any():
             return 0.0
         share = min(dt / (RESTART + DWELL + 4 * float(self.servo.lag[slow].max())), 1.0)

@@ -70,25 +70,23 @@ class Following:
         first : bool
             Whether it is the first tick.
         fitting : Follower, optional
-            At ``wanted``, where all robots can be there.
+            The next one towards ``wanted``, if it is known.
         """
-        new = replace(self, wanted=wanted, lost=None)
-        if self.bounds is None:
-            return new._unbounded(goal, dt, halted, late, first)
-        if first:  # the first reference is where robots stand
-            return new
+        if self.bounds is None or first:  # the first reference is where robots stand
+            new = replace(self, wanted=wanted, lost=None)
+            within = self.bounds is not None
+            return new if within else new._unbounded(goal, dt, halted, late, first)
         if halted is not None:  # what is not finite brings a robot to rest
             goal = torch.where(halted.unsqueeze(-1), torch.nan, goal)
         last = self.follower or self._moving(self.bounds, goal, dt)
         follower = fitting
-        if follower is None or follower.reference is not goal:
+        if follower is None or follower.aim is not goal:
             follower = last.advance(goal, dt)
-            new = replace(new, lost=~goal.isfinite().all(-1))
+        lost = None if follower.reference is goal else ~goal.isfinite().all(-1)
         if late is not None:
             follower = follower.undone(late, last)
-        return replace(
-            new, follower=follower, reference=follower.reference, velocity=follower.velocity
-        )
+        moved = follower.reference, follower.velocity, follower, wanted, lost
+        return type(self)(self.bounds, *moved)
 
     def _unbounded(
         self, goal: Tensor, dt: Seconds, halted: Tensor | None, late: Tensor | None, first: bool

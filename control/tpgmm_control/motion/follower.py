@@ -58,11 +58,14 @@ class Follower:
         The last reference; it has the gradient of a wanted posture that was taken exactly.
     moment : Moment
         How it has moved.
+    aim : Tensor of shape (..., n_joints), optional
+        The wanted posture that the last tick was made towards.
     """
 
     bounds: MotionBounds
     reference: Tensor
     moment: Moment
+    aim: Tensor | None = None
 
     @classmethod
     def at(cls, bounds: MotionBounds, reference: Any, velocity: Any = None) -> Self:
@@ -107,28 +110,8 @@ class Follower:
         """Velocity of the reference [rad/s or m/s], shape (..., n_joints)."""
         return torch.from_numpy(self.moment.motion[1]).to(self.reference)
 
-    def take(self, wanted: Tensor, dt: Seconds) -> Self | None:
-        """The wanted posture as the reference, where that is within bounds for all robots.
-
-        Parameters
-        ----------
-        wanted : Tensor of shape (..., n_joints)
-            At the end of this tick.
-        dt : float or ndarray of shape (...)
-            Duration of the tick, for all robots or of each one [s].
-
-        Returns
-        -------
-        Follower or None
-            None if a joint of a robot cannot follow.
-        """
-        exact = self.moment.taken(as_array(wanted), _column(dt))
-        return (
-            replace(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
-        )
-
     def fits(self, wanted: Tensor, dt: Seconds) -> Tensor:
-        """Robots that :meth:`take` would serve: bool of shape (...)."""
+        """Robots that can be at a wanted posture within bounds: bool of shape (...)."""
         fits = self._fits(self.moment.taken(as_array(wanted), _column(dt))).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
 
@@ -179,19 +162,23 @@ class Follower:
         DataError
             If ``dt`` is not positive.
         """
-        if not np.all((dt > 0) & (dt < np.inf)):
+        if not (0 < dt < np.inf if isinstance(dt, float) else np.all((dt > 0) & (dt < np.inf))):
             raise DataError(f"a tick takes a positive number of seconds, got dt={dt}")
         moment, bounds, raw = self.moment, self.bounds, as_array(wanted)
-        known = np.where(np.isfinite(raw), raw, moment.motion[0])
-        target = np.clip(known, *limit_arrays(bounds)[:2])
+        limits, known = limit_arrays(bounds), np.where(np.isfinite(raw), raw, moment.motion[0])
+        target = np.minimum(np.maximum(known, limits.lower), limits.upper)
         exact = moment.taken(target, _column(dt))
         fits = moment.allows(exact, bounds)
+        as_wanted = fits & (raw == target)
+        if as_wanted.all():
+            return type(self)(bounds, wanted, exact, wanted)
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
-        as_wanted = torch.from_numpy(fits & (raw == target)).to(wanted.device)
         reached = torch.from_numpy(following.motion[0]).to(wanted)
-        return replace(
-            self, reference=torch.where(as_wanted, wanted, reached), moment=following
-        )
+        if wanted.requires_grad:
+            reached = torch.where(
+                torch.from_numpy(as_wanted).to(wanted.device), wanted, reached
+            )
+        return type(self)(bounds, reached, following, wanted)
 
 
 class Moment(NamedTuple):
@@ -252,8 +239,10 @@ class Moment(NamedTuple):
         slope = (position - self.motion[0]) / dt
         return slope, (slope - self.slope) * (2 / (dt + last))
 
-    def _last_dt(self, dt: Seconds) -> Array:
+    def _last_dt(self, dt: Seconds) -> Seconds:
         """Duration of the tick before; of this one if it was the first [s]."""
+        if isinstance(self.dt, float):
+            return self.dt if self.dt > 0 else dt
         return np.where(np.asarray(self.dt) > 0, self.dt, dt)
 
     def allows(self, following: Self, bounds: MotionBounds) -> Mask:
@@ -262,7 +251,9 @@ class Moment(NamedTuple):
         position, velocity, acceleration = following.motion
         size = np.abs(acceleration)
         last = following.dt_before
-        earlier = np.where(np.asarray(self.dt_before) > 0, self.dt_before, last)
+        earlier = self.dt_before
+        if not isinstance(earlier, float) or earlier <= 0:
+            earlier = np.where(np.asarray(earlier) > 0, earlier, last)
         between = (following.dt + last + earlier) / 3
         fits: Mask = size <= limits.acceleration
         fits &= np.abs(acceleration - self.bend) / between <= limits.jerk
@@ -285,19 +276,23 @@ class Moment(NamedTuple):
     def generated(self, exact: Self, asked: Mask, bounds: MotionBounds) -> Self:
         """That step, with the joints that are asked on the fastest way to it."""
         limits, joint = limit_arrays(bounds), np.nonzero(asked)[-1]
-        rates = np.stack((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
+        rates = np.array((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
         target, before = (
-            np.clip(np.rint(x[asked] * GRID) / GRID, limits.lower[joint], limits.upper[joint])
+            np.minimum(
+                np.maximum(np.rint(x[asked] * GRID) / GRID, limits.lower[joint]),
+                limits.upper[joint],
+            )
             for x in (exact.wanted, self.wanted)
         )
-        dt = np.broadcast_to(exact.dt, asked.shape)[asked]
+        dt = (np.zeros(asked.shape) + exact.dt)[asked]
         drift, moved = self.drift[asked], (target - before) / dt
         # a motion is expected to go on only after a while, and to stop at once: a posture that
         # has jumped is not expected further on
         slower = np.where(drift * moved < 0, 0.0, moved)
         rising = drift + np.minimum(1.0, dt / MEMORY) * (moved - drift)
         drift = np.where(np.abs(slower) < np.abs(rising), slower, rising)
-        drift = np.clip(drift, -CRUISE * rates[0], CRUISE * rates[0])
+        fastest = CRUISE * rates[0]
+        drift = np.minimum(np.maximum(drift, -fastest), fastest)
         start = self.motion[:, asked]
         part = first_part(start, target, drift, dt, rates)
         unsafe = ~self._stops(part, asked, bounds)

@@ -47,9 +47,11 @@ def first_part(start: Array, target: Array, drift: Array, dt: Array, limits: Arr
     """
     speed, acceleration, jerk = limits
     reach = speed * dt
-    position = np.clip(target, start[0] - reach, start[0] + reach)
-    found = np.stack((position, (position - start[0]) / dt, np.zeros_like(target)))
+    position = np.minimum(np.maximum(target, start[0] - reach), start[0] + reach)
+    found = np.array((position, (position - start[0]) / dt, np.zeros_like(target)))
     bound = np.isfinite(acceleration) | np.isfinite(jerk)  # others are at once as fast
+    if bound.all():
+        return _planned(start, target, drift, dt, limits)
     if bound.any():
         parts = start[:, bound], target[bound], drift[bound], dt[bound], limits[:, bound]
         found[:, bound] = _planned(*parts)
@@ -123,7 +125,9 @@ def rest_positions(start: Array, acceleration: Array, jerk: Array) -> Array:
 def _stop(start: Array, acceleration: Array, jerk: Array) -> Trajectory | None:
     """The plan of motions to rest."""
     position, at_once = start[0], np.isinf(acceleration) & np.isinf(jerk)
-    asked = _input(np.where(at_once, [position, 0 * position, 0 * position], start))
+    if at_once.any():
+        start = np.where(at_once, [position, 0 * position, 0 * position], start)
+    asked = _input(start)
     asked.max_acceleration = np.minimum(acceleration, ENDLESS).tolist()
     asked.max_jerk = jerk.tolist()
     asked.control_interface = ControlInterface.Velocity
@@ -134,7 +138,7 @@ def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array
     """Motions with bounds on the acceleration or the jerk."""
     speed, acceleration, jerk = limits
     speed = np.minimum(speed, ENDLESS)
-    asked = _input(np.stack((start[0], start[1] - drift, start[2])))
+    asked = _input(np.array((start[0], start[1] - drift, start[2])))
     asked.max_acceleration = np.minimum(acceleration, ENDLESS).tolist()
     asked.max_jerk = jerk.tolist()
     asked.target_position = (target - drift * dt).tolist()
@@ -142,7 +146,7 @@ def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array
     asked.min_velocity = (-speed - drift).tolist()
     plan = _plan(asked)
     if plan is not None:
-        return _at(plan, dt) + np.stack((drift * dt, drift, np.zeros_like(drift)))
+        return _at(plan, dt) + np.array((drift * dt, drift, np.zeros_like(drift)))
     if len(target) > 1:  # one motion that cannot be planned fails all
         singles = (
             _planned(start[:, [i]], target[[i]], drift[[i]], dt[[i]], limits[:, [i]])
@@ -156,6 +160,9 @@ def _planned(start: Array, target: Array, drift: Array, dt: Array, limits: Array
 
 def _at(plan: Trajectory, dt: Array) -> Array:
     """States (3, N) of planned motions after durations (N,)."""
+    first = float(dt[0])
+    if (dt == first).all():
+        return np.array(plan.at_time(first))
     found = np.empty((3, len(dt)))
     for duration in np.unique(dt):
         then = dt == duration

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_control.sensing.pose_filter import OneEuro, PoseFilter
+from tpgmm_control.sensing.states import replace_fields
 from tpgmm_control.sensing.trust import (
     DEAD,
     FLIPPED,
@@ -117,7 +118,7 @@ class Inputs:
             pose = seen.get(name)
             if name in poses or pose is not known[name]:  # a pose of the start is no stream
                 poses[name], filters[name], known[name] = self._pose(name, pose, dt)
-        return replace(
+        return replace_fields(
             self,
             joints=None if quiet else self._joints(joints, dt),
             poses=poses,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from tpgmm_control.sensing.states import check_positive
+from tpgmm_control.sensing.states import check_positive, replace_fields
 from tpgmm_torch.data.frames import LEVER
 
 __all__ = ["OneEuro"]
@@ -111,16 +111,16 @@ class PoseFilter:
         """
         settings = self.settings
         if math.isinf(settings.cutoff):
-            return replace(self, pose=pose, last=pose)
+            return replace_fields(self, pose=pose, last=pose)
         if (pose == self.last).all() and not (self.change.any() or self.history.any()):
             return self
-        side = np.einsum("...i,...i", pose[..., 3:], self.pose[..., 3:])[..., None]
+        side = (pose[..., 3:] * self.pose[..., 3:]).sum(-1, keepdims=True)
         turn = np.copysign(1.0, side) * pose[..., 3:]
         pose = np.concatenate((pose[..., :3], turn), -1)
         change = pose - self.last
         bend = np.square(change - self.change) @ METRIC
         history = np.concatenate((self.history[1:], bend[None]))
-        variance = np.partition(history, MEMORY // 2, axis=0)[MEMORY // 2] / MEDIAN
+        variance = np.sort(history, axis=0)[MEMORY // 2] / MEDIAN
         each = dt[..., None] if isinstance(dt, np.ndarray) else dt
         velocity = self.velocity + _share(settings.speed_cutoff, each) * (
             change / each - self.velocity
@@ -130,10 +130,10 @@ class PoseFilter:
         share = _share(cutoff + settings.slope * speed, dt)
         out = self.pose + share[..., None] * (pose - self.pose)
         turn = out[..., 3:]
-        out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
+        out[..., 3:] = turn / np.sqrt((turn * turn).sum(-1, keepdims=True))
         # a pose without noise passes bit for bit
         out = np.where(share[..., None] == 1, pose, out)
-        return replace(
+        return replace_fields(
             self, pose=out, velocity=velocity, change=change, last=pose, history=history,
             share=share,
         )  # fmt: skip

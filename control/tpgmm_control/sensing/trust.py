@@ -304,7 +304,9 @@ class PoseReading(Reading):
 
     def _faults(self, seen: Floats) -> NDArray[np.int8]:
         turn = seen[..., 3:]
-        unit = np.abs(np.einsum("...i,...i", turn, turn) - 1) < 2e-2
+        unit = np.abs((turn * turn).sum(-1) - 1) < 2e-2
+        if unit.all() and np.isfinite(seen).all():
+            return np.zeros(unit.shape, np.int8)
         impossible = np.where(unit, ACCEPTED, IMPOSSIBLE)
         return np.where(np.isfinite(seen).all(-1), impossible, LOST).astype(np.int8)
 

@@ -100,8 +100,8 @@ def test_a_posture_within_bounds_is_taken_as_it_is():
     for k in range(1, 50):
         wanted = torch.full((3,), 0.3 * (1 - np.cos(1.5 * k * DT)), dtype=torch.float64)
         wanted.requires_grad_()
-        follower = follower.take(wanted, DT)
-        assert follower is not None and follower.reference is wanted
+        follower = follower.advance(wanted, DT)
+        assert follower.reference is wanted
         assert bool(Follower.at(limits, wanted.detach()).fits(wanted, DT))
     slope = 0.3 * 1.5 * np.sin(1.5 * 49 * DT)
     np.testing.assert_allclose(follower.velocity.numpy(), slope, rtol=1e-3)
@@ -111,7 +111,7 @@ def test_who_can_follow_is_told_robot_by_robot():
     follower = Follower.at(bounds(), torch.zeros(2, 3, dtype=torch.float64))
     wanted = torch.tensor([[1e-5, 0.0, 0.0], [0.5, 0.0, 0.0]], dtype=torch.float64)
     assert follower.fits(wanted, DT).tolist() == [True, False]
-    assert follower.take(wanted, DT) is None
+    assert follower.advance(wanted, DT).reference is not wanted
     moved = follower.advance(wanted.requires_grad_(), DT).reference
     assert torch.equal(moved[0], wanted[0]) and 0 < moved[1, 0] < 0.01
     # what was taken has its gradient, what was generated none
@@ -181,7 +181,7 @@ def test_without_bounds_what_is_wanted_is_taken():
     limits = MotionBounds.of(ROBOT)
     follower = Follower.at(limits, [0.0, 0.0, 0.0])
     wanted = torch.tensor([100.0, -7.0, 0.1], dtype=torch.float64)
-    assert follower.take(wanted, DT).reference is wanted
+    assert follower.advance(wanted, DT).reference is wanted
     # and what is bound by position or speed alone goes as far as that allows
     limits = MotionBounds(
         limits.lower, limits.upper.new_tensor([1.0, 9.0, 9.0]),

@@ -6,6 +6,7 @@ import torch
 
 from tests.support.robot_zoo import g1, random_joints, upper_body, written_out, zoo
 from tpgmm_torch import quaternions
+from tpgmm_torch.robots.one_posture import OnePosture
 
 ROBOTS = {
     "upper body": upper_body,
@@ -60,3 +61,18 @@ def test_second_derivatives_are_those_of_finite_differences(count):
         return robot.state(q).positions
 
     assert torch.autograd.gradgradcheck(position, joints, fast_mode=True)
+
+
+@pytest.mark.parametrize("make", ROBOTS.values(), ids=list(ROBOTS))
+def test_one_posture_in_numpy_is_the_same(make):
+    robot = make()
+    one = OnePosture(robot.tree, len(robot.links), robot.n_joints)
+    for joints in random_joints(robot, 20, seed=3):
+        state = robot.state(joints)
+        positions, orientations, rows = one(joints.numpy())
+        jacobians = torch.from_numpy(rows[:-1]).reshape(state.jacobians.shape)
+        found = torch.from_numpy(positions), torch.from_numpy(orientations), jacobians
+        torch.testing.assert_close(found[0], state.positions, rtol=0, atol=1e-12)
+        torch.testing.assert_close(found[1], state.orientations, rtol=0, atol=1e-12)
+        torch.testing.assert_close(found[2], state.jacobians, rtol=0, atol=1e-12)
+        assert not rows[-1].any()
