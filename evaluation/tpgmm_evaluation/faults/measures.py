@@ -55,7 +55,7 @@ def measure(log: Log) -> Measures:
         the durations in which references may move (:attr:`Run.drive`), ``infinite`` ones, and
         those with a ``false`` status; ``step``, the largest change in units of what its bound
         allows in a usual period; ``raised``, whether there was an exception; ``ended``;
-        ``open``, whether it neither finished, nor waits at last and names a joint, nor is held
+        ``open``, whether it neither finished, nor waits at last and names a joint, nor holds
         for readings that last; ``stuck``, whether it did not finish with nothing in its way;
         ``mute``, for how long its status was running or its reason empty while it stood [s];
         ``late``, seconds after the skill and all interruptions; ``gap``, between reference and
@@ -202,7 +202,9 @@ def _offset(log: Log, ticks: Tick) -> Array:
 
 def _open(log: Log, ticks: Tick) -> bool:
     names = log.run.situation.skill.kinematics.joint_names
-    waits = ticks.status[-1] == "waiting" and any(name in log.reason for name in names)
+    waits = ticks.status[-1] in ("waiting", "displaced") and any(
+        name in log.reason for name in names
+    )
     held = ticks.status[-1] == "holding" and _readings(log, ticks)[0][-1]
     return bool(log.error) or not (log.done < np.inf or waits or held)
 
