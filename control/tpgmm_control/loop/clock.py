@@ -1,12 +1,17 @@
-"""How the time of a running skill goes on, as an object and as text."""
+"""How the time of a running skill goes on, and for how long robots are waited for."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
+import numpy as np
+
+from tpgmm_control.sensing.servo import Flags
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["Clock"]
@@ -98,7 +103,7 @@ class Clock:
         settings: dict[str, Any] = {"kind": kind.strip()}
         for option in options:
             name, value = map(str.strip, option.partition("=")[::2])
-            if name in settings or name not in {field.name for field in fields(cls)}:
+            if name in settings or name not in {one.name for one in fields(cls)}:
                 raise DataError(
                     f"clock {text!r}: {name!r} is no option or given twice; there are speed, "
                     "initial, arrivals and wait_limit, each written as NAME=VALUE"
@@ -109,10 +114,62 @@ class Clock:
     def __str__(self) -> str:
         """The inverse of :meth:`parse`; defaults are left out."""
         options = []
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
-            if value != field.default:
+        for one in fields(self)[1:]:
+            value = getattr(self, one.name)
+            if value != one.default:
                 several = value if isinstance(value, tuple) else (value,)
-                texts = (str(one).removesuffix(".0") for one in several)
-                options.append(f"{field.name}={'/'.join(texts)}")
+                texts = (str(each).removesuffix(".0") for each in several)
+                options.append(f"{one.name}={'/'.join(texts)}")
         return ":".join([self.kind, ",".join(options)] if options else [self.kind])
+
+
+@dataclass(frozen=True, eq=False)
+class Patience:
+    """How long B robots have been waited for; immutable.
+
+    Parameters
+    ----------
+    limit : float
+        How long a robot is waited for before it stops for good [s].
+    waited : array of shape (B,)
+        For how long that has been, without a break [s].
+    stopped : mapping of int to str
+        Robots that have stopped, and why.
+    """
+
+    limit: float
+    waited: Array
+    stopped: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def stands(self) -> Flags:
+        """Robots that have stopped (B,)."""
+        stands: Flags = np.zeros(len(self.waited), bool)
+        stands[list(self.stopped)] = True
+        return stands
+
+    def advance(self, waits: Flags, passed: Array, reasons: Mapping[int, str]) -> Self:
+        """Count how long robots are waited for, and stop those that have been too long.
+
+        Parameters
+        ----------
+        waits : bool array of shape (B,)
+            Robots that are waited for at this tick.
+        passed : array of shape (B,)
+            Duration of the tick [s].
+        reasons : mapping of int to str
+            Why, by robot.
+        """
+        waited, stopped = np.where(waits, self.waited + passed, 0.0), dict(self.stopped)
+        for row in np.flatnonzero(waited >= self.limit).tolist():
+            why = reasons.get(row, "")
+            stopped.setdefault(row, f"stopped for good after {self.limit:g} s: {why}")
+        return replace(self, waited=waited, stopped=stopped)
+
+    def announce(self, reasons: Mapping[int, str]) -> dict[int, str]:
+        """Add when robots will stop to the reasons why they are waited for."""
+        left = self.limit - self.waited
+        return {
+            row: self.stopped.get(row, f"{text}; stops for good in {left[row]:.1f} s")
+            for row, text in reasons.items()
+        } | dict(self.stopped)

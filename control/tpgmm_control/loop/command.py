@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_control.impedance.stiffness import Impedance
+from tpgmm_control.loop.clock import Patience
 from tpgmm_control.loop.gates import Gates
 from tpgmm_control.loop.locate import Mode, Progress
-from tpgmm_control.loop.patience import Patience
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.servo import Flags
 from tpgmm_torch.data.arrays import Array
@@ -257,8 +257,7 @@ def statuses(
     codes, texts = _find_statuses(progress, names, wanted, ended, inputs, gates)
     for row, (waits, reason) in obstructed.items():
         codes[row], texts[row] = (Status.WAITING.code if waits else codes[row]), reason
-    for robots, reason in held:
-        rows = [] if robots is None else np.flatnonzero(robots).tolist()
+    for reason, rows in _find_held(held).items():
         codes[rows] = Status.HOLDING.code
         texts |= dict.fromkeys(rows, reason)
     if patience is not None:
@@ -271,6 +270,13 @@ def statuses(
     if patience is not None:
         codes[patience.stands] = Status.STOPPED.code
     return codes, reasons
+
+
+def _find_held(held: Sequence[tuple[Flags | None, str]]) -> dict[str, list[int]]:
+    """Find the robots that stand for each reason."""
+    return {
+        reason: np.flatnonzero(robots).tolist() for robots, reason in held if robots is not None
+    }
 
 
 def _index_reasons(

@@ -55,21 +55,20 @@ from torch import Tensor
 from tpgmm_control.contact.admittance import Admittance, Offsets
 from tpgmm_control.impedance.stiffness import Impedance
 from tpgmm_control.loop import command as commands
-from tpgmm_control.loop.clock import Clock
+from tpgmm_control.loop.clock import Clock, Patience
 from tpgmm_control.loop.command import Command, Status
 from tpgmm_control.loop.estimate import choose, estimate
+from tpgmm_control.loop.expected_gaps import ExpectedGaps
 from tpgmm_control.loop.gates import Gates, Moment
-from tpgmm_control.loop.gripping import gripping_joints
 from tpgmm_control.loop.hold import Holds
 from tpgmm_control.loop.locate import CATCH_UP, LONGEST_TICK, Mode, Progress, Seen
-from tpgmm_control.loop.patience import Patience
 from tpgmm_control.loop.places import Places
 from tpgmm_control.loop.reach import Fade, nearest
 from tpgmm_control.motion.follow import Following
 from tpgmm_control.motion.follower import Follower, Seconds
 from tpgmm_control.obstacles.avoid import Avoidance
 from tpgmm_control.obstacles.scene import Scene
-from tpgmm_control.sensing.expected_gaps import ExpectedGaps
+from tpgmm_control.sensing.gripping import gripping_joints
 from tpgmm_control.sensing.inputs import Inputs
 from tpgmm_control.sensing.pose_filter import OneEuro
 from tpgmm_control.sensing.servo import Flags

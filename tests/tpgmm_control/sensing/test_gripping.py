@@ -3,7 +3,7 @@
 import pytest
 
 from tests.support.robot_zoo import upper_body
-from tpgmm_control.loop.gripping import gripping_joints
+from tpgmm_control.sensing.gripping import gripping_joints
 from tpgmm_datasets.robots import so101_urdf
 from tpgmm_torch.robots.kinematics import JointSpace
 from tpgmm_torch.robots.robot import Robot
