@@ -142,8 +142,8 @@ for name, model in models.items():
 # --------------
 # Where one thing must not yield. Beyond what was shown the compromise loses centimetres at the
 # tip; with priorities the elbow pays, and the tip arrives. It is no default: joints swing out
-# for what goes first, up to their limits of speed, and then they are late: a few of sixty tips
-# miss by centimetres. On the left how the arm ends at 50 cm, and where it began.
+# for what goes first, up to their limits of speed, and then they are late: about a tenth of the
+# tips miss, some by far. On the left how the arm ends at 50 cm, and where it began.
 
 plt.style.use(STYLE)
 figure, (plane, tips, speeds) = plt.subplots(

@@ -237,7 +237,8 @@ class Controller:
         self._needs_wrench = self._offsets is not None
         self._begin_at(Clock.parse(clock), start, begin, end)
         self._fade, self._search = Fade.start(start, blend), skill.posture_search()
-        self._gaps = ExpectedGaps.start(skill, start, blend)
+        # what is not for a robot, as a rollout, is where the joints should be
+        self._gaps = ExpectedGaps.start(skill, start, blend) if self._trusts else None
         bounds = _motion_bounds(skill, bounds)
         self._following = Following.start(bounds, start, at_rest)
         self._avoidance, batch = None, len(self._progress)

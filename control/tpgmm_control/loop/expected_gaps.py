@@ -59,7 +59,9 @@ class ExpectedGaps:
             return None
         none = torch.zeros_like(joints)
         floor = np.full((joints[..., 0].numel(), joints.shape[-1]), FLOOR)
-        return cls(_find_limbs(skill.kinematics), Fade.start(joints, blend), none, floor)
+        return cls(
+            _find_limbs(skill.kinematics, joints), Fade.start(joints, blend), none, floor
+        )
 
     def advance(self, skill: Skill, time: Array, dt: float | Tensor, first: bool) -> Self:
         """Find the gaps at a tick.
@@ -88,12 +90,11 @@ class ExpectedGaps:
         return replace(self, fade=self.fade.again(robots))
 
 
-def _find_limbs(kinematics: Kinematics) -> NDArray[np.bool_]:
+def _find_limbs(kinematics: Kinematics, joints: Tensor) -> NDArray[np.bool_]:
     """Find the joints that move each link; where there is no link, each joint is alone."""
-    lower = torch.zeros_like(kinematics.lower)
     alone: NDArray[np.bool_] = np.eye(kinematics.n_joints, dtype=bool)
     if not kinematics.links:
         return alone
-    state = kinematics.state(lower.clamp(kinematics.lower, kinematics.upper))
+    state = kinematics.state(joints.reshape(-1, joints.shape[-1])[0])
     moves: NDArray[np.bool_] = (state.jacobians.abs() > 0).any(-2).numpy(force=True)
     return np.concatenate((moves.reshape(-1, kinematics.n_joints), alone[~moves.any(0)]))

@@ -75,7 +75,7 @@ def test_a_drive_that_sags_is_told_of_and_an_integral_term_corrects_it():
     assert float(command.offset.abs().max()) == pytest.approx(0.1, rel=0.05)
     assert gaps[-1] == pytest.approx(0.1, rel=0.05)
     _, statuses, seconds, gaps = driven(sags, integral=1.0)
-    assert statuses == {"running"} and seconds < LAST + 1
+    assert statuses <= {"running", "waiting"} and seconds < LAST + 1
     assert gaps[-1] < 0.01
 
 
