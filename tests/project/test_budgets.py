@@ -91,14 +91,14 @@ class Ceiling:
 #: Lower them with the code; an entry goes when its budget is reached.
 CEILINGS: dict[str, Ceiling] = {
     "lines of tpgmm_torch": Ceiling(12261, "0.4.0"),
-    "lines of tpgmm_control": Ceiling(4721, "0.4.0"),
+    "lines of tpgmm_control": Ceiling(4720, "0.4.0"),
     "lines of tpgmm_datasets": Ceiling(4547, "0.4.0"),
     "lines of tpgmm_vision": Ceiling(2555, "0.4.0"),
     "lines of tpgmm_tools": Ceiling(3377, "0.4.0"),
     "lines of lerobot_env_bimanual": Ceiling(5313, "0.4.0"),
     "lines of tpgmm_evaluation": Ceiling(4796, "0.4.0"),
     "lines of benchmarks": Ceiling(1556, "0.4.0"),
-    "lines of tests": Ceiling(35045, "0.4.0"),
+    "lines of tests": Ceiling(35032, "0.4.0"),
     # the loop will be rewritten for one robot
     "complex functions of run": Ceiling(6, "0.4.0"),
     "participles of run": Ceiling(34, "0.4.0"),

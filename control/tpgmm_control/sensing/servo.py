@@ -287,9 +287,7 @@ class Servo:
         learning = known & learns & (self.judgement.excess < 1)
         motion, ran = before.second - before.slow, self.readings.median - slow
         self._learn_lags(motion, ran, dt, learning)  # medians are a tick late
-        # what was asked to move, and did not, is held: that is no offset
-        stands = (np.abs(motion.mean(0)) > FLOOR) & (np.abs(ran) < FLOOR / 2)
-        self._learn_offsets(reference, dt, learning & ~stands)
+        self._learn_offsets(reference, dt, learning)
 
     def _estimate_noise(self, gaps: Array, weight: Array, known: Flags, dt: float) -> Array:
         """Estimate the variance of readings from how the last three gaps bend."""

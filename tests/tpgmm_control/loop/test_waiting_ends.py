@@ -59,21 +59,6 @@ def test_a_robot_that_nobody_frees_stops_for_good():
     assert "stopped for good after 2 s: joint" in command.reason()
 
 
-@pytest.mark.parametrize("joint", [2, 3])
-def test_what_blocks_a_joint_from_the_start_is_not_taken_for_an_offset(joint):
-    run = begin()
-    most = 0.0
-    for k in range(400):
-        before = run.joints
-        command = run.tick()
-        if k > 10:
-            run.joints = np.where(np.eye(4)[joint], before, run.joints)
-            most = max(most, abs(run.reference[joint] - run.joints[joint]))
-    assert str(command.status) in ("waiting", "displaced")
-    assert f"joint {'abcd'[joint]!r}" in command.reason()
-    assert most < 0.2
-
-
 @pytest.mark.parametrize("size", [0.03, 0.06, 0.1])
 def test_a_contact_that_rubs_is_overcome(size):
     run = begin(holds=True, lag=0.2)
