@@ -91,7 +91,7 @@ class Ceiling:
 #: Lower them with the code; an entry goes when its budget is reached.
 CEILINGS: dict[str, Ceiling] = {
     "lines of tpgmm_torch": Ceiling(12261, "0.4.0"),
-    "lines of tpgmm_control": Ceiling(4720, "0.4.0"),
+    "lines of tpgmm_control": Ceiling(4717, "0.4.0"),
     "lines of tpgmm_datasets": Ceiling(4547, "0.4.0"),
     "lines of tpgmm_vision": Ceiling(2555, "0.4.0"),
     "lines of tpgmm_tools": Ceiling(3377, "0.4.0"),

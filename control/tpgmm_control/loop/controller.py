@@ -566,7 +566,7 @@ class Controller:
         """Count for how long robots are waited for."""
         assert self._patience is not None
         waits = command.of(Status.WAITING) | command.of(Status.DISPLACED)
-        passed = np.zeros(len(self._progress)) + np.ravel(tick.seconds)
+        passed = self._measure_tick(tick)
         indices = list(np.ndindex(*self.reference.shape[:-1]))
         why = {row: command.reason(index) for row, index in enumerate(indices)}
         why = {row: text.partition("; stops for good")[0] for row, text in why.items()}
@@ -669,13 +669,10 @@ class Controller:
     def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
         """The posture that is wanted, and the follower of the next tick, if it is known."""
         seconds = 0.0 if tick.first else _each(tick.drive)
-        posture = self._wanted_posture
-        if self._avoidance is not None:
-            posture = posture + (self._following.reference - self.reference)
+        posture = self._postures(tick, measured=False)
         shift, self._fade = self._fade.advance(posture, found.joints, seconds, tick.first)
         if self._gaps is not None:
-            time = np.zeros(len(self._progress)) + as_array(tick.time).reshape(-1)
-            self._gaps = self._gaps.advance(self._skill, time, seconds, tick.first)
+            self._gaps = self._gaps.advance(self._skill, self._times, seconds, tick.first)
             shift = self._gaps.gap if shift is None else shift + self._gaps.gap
         wanted, fitting = self._rounded(found.joints, shift), None
         if not tick.first:
